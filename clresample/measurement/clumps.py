@@ -44,12 +44,13 @@ FRINGE = 0.03
 # [1] two bodies are one where the fainter one's level exceeds that of the saddle between them by
 # less, and where the saddle has at least that part of the brighter one's level
 SAME_BODY, SAME_LIGHT = 0.4, 0.2
-# [1] light of a nucleus in its basin above its saddle: over that of a point as high, and of all of the
-# body's. Of 90 peaks in 14 large galaxies (fields of seeds 1 - 3) it holds for nuclei alone: a clump
-# has as much light or is as wide, not both
+# [1] light of a nucleus in its basin above its saddle: over that of a point as high, and of all of
+# the body's. It parts the one pair that overlaps in `simulate field --sky bright` of seeds 1 - 3 and
+# none of their other 12 bright bodies, nor any of seeds 4 and 5
 NUCLEUS_EXTENT, NUCLEUS_PART = 4.0, 0.045
-# [1] of a peak's distance from its body, in radii of outlines: nearer by this factor to another one,
-# and inside that one's radius, it is the other one's
+# [1] of a peak's distance from its body, in radii of outlines: nearer by this factor to another
+# one, and inside that one's radius, it is the other one's. So are all of the four clumps of seeds
+# 1 - 3 that rise from a neighbour's light
 NEARER = 0.7
 # [1] of a body's level: its outline, down to which its light is added up
 OUTLINE = 0.1
@@ -117,7 +118,7 @@ class Bodies:
     structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def body_at(self, position) -> int:
-        """Number of the nearest body of a position (2,) [px], -1 beyond all outlines of bright ones."""
+        """Number of the bright body that a position (2,) [px] belongs to, -1 beyond all outlines."""
         holding = [i for i, body in enumerate(self.bodies) if body.holds(position)]
         return _owner(self.bodies, holding, np.asarray(position)) if holding else -1
 
@@ -216,7 +217,8 @@ def _divided(image, outline, centers, level, point, chance, bright):
     for i, center in enumerate(centers):
         own = mask & (nearest == i)
         clump = CLUMP / max(1.0, chance * mask.sum()) if bright else 0.0
-        found.append(Body(center, level, float(image[where][own].sum()) / point, (where, own), clump))
+        light = float(image[where][own].sum()) / point
+        found.append(Body(center, level, light, (where, own), clump))
     return found
 
 

@@ -199,15 +199,13 @@ def _without_ghosts(result, found, places, threshold):
     saturated = np.zeros(result.frame.shape)
     points, of_points = _point_sources(result), {}
     for i, o in enumerate(result.observations):
-        if isinstance(o.psf_field, StarPSFs):
-            sky = result.sky[result.channel_slices()[i], None, None]
-            image = result.model(i) - sky
-        elif points:
-            image = sum(result.source_model(k, i) for k in points)
-        else:
+        own = isinstance(o.psf_field, StarPSFs)
+        sky = result.sky[result.channel_slices()[i], None, None]
+        images = [result.model(i) - sky] if own else [result.source_model(k, i) for k in points]
+        if not images:
             continue
-        light = signal_of(_with_data(o, image, o.weights), result.frame, places[i]).flat()
-        if isinstance(o.psf_field, StarPSFs):
+        light = signal_of(_with_data(o, sum(images), o.weights), result.frame, places[i]).flat()
+        if own:
             saturated = np.maximum(saturated, light)
         else:
             of_points[o.label] = light

@@ -232,18 +232,17 @@ def _second_look(job, given, cuts, results, part, n_round):
     blend are looked at after their rough fits: their new sources are left in the part, for the next
     round. Searched a round later, when neighbours are subtracted, they cost one more fit.
     """
+    if n_round > 0:
+        return cuts, results
     cuts, results, again = list(cuts), list(results), []
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
-        is_piece = bool(cut.patch.siblings)
         if isinstance(result, Failure) or _chi2(result) > MAX_CHI2:
-            continue
-        if n_round > 0:
             continue
         try:
             rows = _found(job, given, cut, result)
         except ERRORS:
             continue  # the fit stands as it is
-        if is_piece:
+        if cut.patch.siblings:
             part.found += [(cut.patch.number, *row) for row in rows]
         elif rows:
             again.append((i, cut.joined(rows)))
