@@ -45,8 +45,8 @@ FRINGE = 0.03
 # less, and where the saddle has at least that part of the brighter one's level
 SAME_BODY, SAME_LIGHT = 0.4, 0.2
 # [1] light of a nucleus in its basin above its saddle: over that of a point as high, and of all of
-# the body's. It parts the one pair that overlaps in `simulate field --sky bright` of seeds 1 - 3 and
-# none of their other 12 bright bodies, nor any of seeds 4 and 5
+# the body's. It parts the one pair that overlaps in `simulate field --sky bright` of seeds 1 - 3
+# and none of their other 12 bright bodies, nor any of seeds 4 and 5
 NUCLEUS_EXTENT, NUCLEUS_PART = 4.0, 0.045
 # [1] of a peak's distance from its body, in radii of outlines: nearer by this factor to another
 # one, and inside that one's radius, it is the other one's. So are all of the four clumps of seeds
@@ -80,7 +80,7 @@ class Body:
     @property
     def radius(self) -> float:
         """Radius [px] of a disk of the outline's area."""
-        return float(np.sqrt(self.outline[1].sum() / np.pi))
+        return float(np.sqrt(max(self.outline[1].sum(), 1) / np.pi))
 
     def distance(self, position) -> float:
         """Distance of a position (2,) [px] from the centre in radii, infinite from faint bodies."""
@@ -118,7 +118,7 @@ class Bodies:
     structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def body_at(self, position) -> int:
-        """Number of the bright body that a position (2,) [px] belongs to, -1 beyond all outlines."""
+        """Number of the bright body that holds a position (2,) [px], -1 beyond all outlines."""
         holding = [i for i, body in enumerate(self.bodies) if body.holds(position)]
         return _owner(self.bodies, holding, np.asarray(position)) if holding else -1
 
@@ -157,9 +157,12 @@ def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
         if np.minimum(light, level).sum() < WIDE * light.sum():
             continue
         bright = level >= BRIGHT * threshold
-        centers = [_center(image, outline, level, at[members], area, bright)]
-        if bright:
-            centers += _nuclei(image, basins, outline[0], at[members], base[members], point)
+        center = _center(image, outline, level, at[members], area, bright)
+        nuclei = (
+            _nuclei(image, basins, outline[0], at[members], base[members], point) if bright else []
+        )
+        is_peak = (at[members] == center).all(axis=1).any()
+        centers = [center, *nuclei] if is_peak or not nuclei else nuclei
         parts = _divided(image, outline, centers, level, point, CHANCE * scale**2, bright)
         found += parts
         of_tree += [(members, range(len(found) - len(parts), len(found)))]
