@@ -94,7 +94,7 @@ def test_a_large_piece_has_many_pixels_times_sources():
     [
         (True, False, {}, 60, False),
         (True, True, {}, 60, False),
-        (False, True, {}, 250, True),
+        (False, True, {}, 150, True),
         (False, False, {}, 500, True),
         (True, False, {"max_iter": 10}, 10, False),
         (True, True, {"prior": None}, 500, True),
