@@ -167,11 +167,18 @@ def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
         found += parts
         of_tree += [(members, range(len(found) - len(parts), len(found)))]
     owners, structure = np.full(n, -1), np.zeros(n, bool)
+    apart = np.ones(n, bool)
     for members, parts in of_tree:
+        apart[members] = False
         for i in members:
             owner = _owner(found, parts, at[i])
             is_clump, is_member = found[owner].takes(heights[i] - base[i], base[i])
             structure[i] = is_clump
+            owners[i] = owner if is_member else -1
+    for i in np.flatnonzero(apart) if found else ():  # such as the knotty side of a disk
+        owner = min(range(len(found)), key=lambda k: found[k].distance(at[i]))
+        if found[owner].distance(at[i]) < 1:
+            is_member = found[owner].takes(heights[i], max(base[i], threshold))[1]
             owners[i] = owner if is_member else -1
     return Bodies(tuple(found), owners, structure)
 

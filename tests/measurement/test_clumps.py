@@ -219,3 +219,14 @@ def test_what_a_stars_psf_leaves_is_no_source_but_what_a_galaxy_does_may_be(heig
     component = Component(0, (0, 0), light / light.max(), np.array([light.max()]))
     result = blend([component], observations=(o,), grid=grid)
     assert len(detect_more(result).sources) == n_more
+
+
+def test_a_knot_beside_a_galaxys_light_is_in_its_group_inside_its_radius():
+    """Its disk is hidden there."""
+    knots, away = [(60, 81), (52, 80)], (60, 110)
+    image = disk(20)
+    image[:, 76:] = 0
+    image += sum(point(at, 100) for at in (*knots, away))
+    found = judged(image, [MIDDLE, *knots, away])
+    assert len(found.bodies) == 1
+    assert found.owners.tolist() == [0, 0, 0, -1]
