@@ -46,7 +46,7 @@ FRINGE = 0.03
 SAME_BODY, SAME_LIGHT = 0.4, 0.2
 # [1] light of a nucleus in its basin above its saddle: over that of a point as high, and of all of
 # the body's. It parts the one pair that overlaps in `simulate field --sky bright` of seeds 1 - 3
-# and none of their other 12 bright bodies, nor any of seeds 4 and 5
+# and none of their other 14 bright bodies, nor any of seeds 4 and 5
 NUCLEUS_EXTENT, NUCLEUS_PART = 4.0, 0.045
 # [1] of a peak's distance from its body, in radii of outlines: nearer by this factor to another
 # one, and inside that one's radius, it is the other one's. So are all of the four clumps of seeds
