@@ -50,6 +50,14 @@ FRINGE = 0.03
 # [1] Two bodies are merged if the fainter one's level exceeds the saddle between them by less than
 # the first number, and the saddle is at least the second number times the brighter one's level.
 SAME_BODY, SAME_LIGHT = 0.4, 0.2
+# [1] light of a nucleus in its basin above its saddle: over that of a point as high, and of all of
+# the body's. It parts the one pair that overlaps in `simulate field --sky bright` of seeds 1 - 3
+# and none of their other 14 bright bodies, nor any of seeds 4 and 5
+NUCLEUS_EXTENT, NUCLEUS_PART = 4.0, 0.045
+# [1] of a peak's distance from its body, in radii of outlines: nearer by this factor to another
+# one, and inside that one's radius, it is the other one's. So are all of the four clumps of seeds
+# 1 - 3 that rise from a neighbour's light
+NEARER = 0.7
 # [1] of a body's level: its outline, down to which its light is added up
 OUTLINE = 0.1
 # [1] of a body's level, at which light is clipped to find its centre
@@ -74,6 +82,24 @@ class Body:
     light: float
     outline: tuple
     clump: float
+
+    @property
+    def radius(self) -> float:
+        """Radius [px] of a disk of the outline's area."""
+        return float(np.sqrt(max(self.outline[1].sum(), 1) / np.pi))
+
+    def distance(self, position) -> float:
+        """Distance of a position (2,) [px] from the centre in radii, infinite from faint bodies."""
+        away = np.hypot(*(position - self.center))
+        return float(away) / self.radius if self.clump > 0 else np.inf
+
+    def holds(self, position) -> bool:
+        """Returns True if the outline of a bright body holds a position (2,) [px]."""
+        if self.clump == 0:
+            return False
+        (rows, columns), mask = self.outline
+        y, x = np.rint(position).astype(int) - [rows.start, columns.start]
+        return bool(0 <= y < mask.shape[0] and 0 <= x < mask.shape[1] and mask[y, x])
 
     def takes(self, above, base):
         """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.
@@ -100,14 +126,8 @@ class Bodies:
 
     def body_at(self, position) -> int:
         """Number of the bright body whose outline contains a position (2,) [px], -1 for none."""
-        y, x = np.rint(position).astype(int)
-        for i, body in enumerate(self.bodies):
-            (rows, columns), mask = body.outline
-            y_in, x_in = y - rows.start, x - columns.start
-            held = body.clump > 0 and 0 <= y_in < mask.shape[0] and 0 <= x_in < mask.shape[1]
-            if held and mask[y_in, x_in]:
-                return i
-        return -1
+        holding = [i for i, body in enumerate(self.bodies) if body.holds(position)]
+        return _owner(self.bodies, holding, np.asarray(position)) if holding else -1
 
 
 def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
@@ -130,8 +150,10 @@ def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
         tree.join(a, b, height)
     tree.end(threshold)
     number, base = np.array([tree.last(b) for b in tree.body[basin]], int), tree.level[basin]
+    heights = image[at[:, 0], at[:, 1]]
+    point = POINT_AREA * fwhm_px**2
     found: list[Body] = []
-    owners, structure = np.full(n, -1), np.zeros(n, bool)
+    of_tree = []
     for one in np.unique(number[number >= 0]):
         level = tree.levels[one]
         members = np.flatnonzero((number == one) & (base > FRINGE * level))
@@ -141,21 +163,80 @@ def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
         light = image[outline[0]][outline[1]]
         if np.minimum(light, level).sum() < WIDE * light.sum():
             continue
-        body = Body(
-            _center(image, outline, level, at[members], area, level >= BRIGHT * threshold),
-            level,
-            float(light.sum()) / (POINT_AREA * fwhm_px**2),
-            outline,
-            0.0
-            if level < BRIGHT * threshold
-            else CLUMP / max(1.0, CHANCE * outline[1].sum() * scale**2),
+        bright = level >= BRIGHT * threshold
+        center = _center(image, outline, level, at[members], area, bright)
+        nuclei = (
+            _nuclei(image, basins, outline[0], at[members], base[members], point) if bright else []
         )
-        above = image[at[members, 0], at[members, 1]] - base[members]
-        is_clump, is_member = body.takes(above, base[members])
-        structure[members] = is_clump
-        owners[members[is_member]] = len(found)
-        found.append(body)
+        is_peak = (at[members] == center).all(axis=1).any()
+        centers = [center, *nuclei] if is_peak or not nuclei else nuclei
+        parts = _divided(image, outline, centers, level, point, CHANCE * scale**2, bright)
+        found += parts
+        of_tree += [(members, range(len(found) - len(parts), len(found)))]
+    owners, structure = np.full(n, -1), np.zeros(n, bool)
+    apart = np.ones(n, bool)
+    for members, parts in of_tree:
+        apart[members] = False
+        for i in members:
+            owner = _owner(found, parts, at[i])
+            is_clump, is_member = found[owner].takes(heights[i] - base[i], base[i])
+            structure[i] = is_clump
+            owners[i] = owner if is_member else -1
+    for i in np.flatnonzero(apart) if found else ():  # such as the knotty side of a disk
+        owner = min(range(len(found)), key=lambda k: found[k].distance(at[i]))
+        if found[owner].distance(at[i]) < 1:
+            is_member = found[owner].takes(heights[i], max(base[i], threshold))[1]
+            owners[i] = owner if is_member else -1
     return Bodies(tuple(found), owners, structure)
+
+
+def _owner(bodies, parts, position) -> int:
+    """Number of the body of a peak at (2,) [px], that rises from some bodies' (parts) light.
+
+    It is the nearest of these, or another one that is far nearer.
+    """
+    away = [body.distance(position) for body in bodies]
+    own, other = min(parts, key=away.__getitem__), int(np.argmin(away))
+    return other if away[other] < min(1.0, NEARER * away[own]) else own
+
+
+def _nuclei(image, basins, where, at, base, point):
+    """Peaks at (k, 2) [px], on bases (k,) [sigma], that are nuclei: positions (2,) [px].
+
+    where: slices of the body; point [px]: area of a point source's image
+    """
+    low = np.array([where[0].start, where[1].start])
+    image, basins = image[where], basins[where]
+    inside = ((at >= low) & (at < low + image.shape)).all(axis=1)
+    at, base = at[inside] - low, base[inside]
+    numbers = basins[at[:, 0], at[:, 1]]
+    all_light, found = image[np.isin(basins, numbers)].sum(), []
+    for place, number, saddle in zip(at, numbers, base, strict=True):
+        above = np.maximum(image[basins == number] - saddle, 0).sum()
+        height = image[tuple(place)] - saddle
+        if above > max(NUCLEUS_EXTENT * point * height, NUCLEUS_PART * all_light):
+            found.append((place + low).astype(float))
+    return found
+
+
+def _divided(image, outline, centers, level, point, chance, bright):
+    """The Bodies of an outline, one of each centre (2,) [px]: its pixels nearest to that.
+
+    level [sigma]: of all; point [px]: area of a point source's image; chance [px^-2]: of sources
+    by chance; bright: whether peaks on them can be structure
+    """
+    where, mask = outline
+    centers = np.unique(centers, axis=0)
+    y, x = np.indices(mask.shape)
+    away = [np.hypot(y + where[0].start - c[0], x + where[1].start - c[1]) for c in centers]
+    nearest = np.argmin(away, axis=0)
+    found = []
+    for i, center in enumerate(centers):
+        own = mask & (nearest == i)
+        clump = CLUMP / max(1.0, chance * mask.sum()) if bright else 0.0
+        light = float(image[where][own].sum()) / point
+        found.append(Body(center, level, light, (where, own), clump))
+    return found
 
 
 class _Tree:

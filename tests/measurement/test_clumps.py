@@ -24,10 +24,11 @@ def point(at, height, width=FWHM * 2**0.5 / 2.355):
     return height * np.exp(-((y - at[0]) ** 2 + (x - at[1]) ** 2) / (2 * width**2))
 
 
-def disk(size, height=400.0):
+def disk(size, height=400.0, at=MIDDLE):
     """An exponential disk of a half-light radius [px], flat in its core."""
-    y, x = np.indices((SIZE, SIZE)) - MIDDLE[0]
-    return height * np.exp(-1.678 * np.maximum(np.hypot(y, x) - 2, 0) / size)
+    y, x = np.indices((SIZE, SIZE))
+    away = np.hypot(y - at[0], x - at[1])
+    return height * np.exp(-1.678 * np.maximum(away - 2, 0) / size)
 
 
 def judged(image, places, scale=0.1):
@@ -181,3 +182,51 @@ def test_what_a_fit_leaves_of_a_large_galaxys_structure_is_no_source():
     assert len(found[0].sources) == len(found[0].hosts) == 0
     assert len(found[1].sources) >= 1
     assert set(found[1].hosts.tolist()) == {0}  # each of them may be a clump of the galaxy
+
+
+def test_two_galaxies_in_one_light_are_two_bodies_with_their_own_clumps():
+    other, clumps = (60, 80), [(44, 56), (74, 88)]
+    image = disk(16) + disk(8, 800.0, other) + sum(point(at, 900) for at in clumps)
+    found = judged(image, [MIDDLE, other, *clumps])
+    assert [body.center.tolist() for body in found.bodies] == [[60, 60], [60, 80]]
+    assert found.owners.tolist() == [0, 1, 0, 1]
+    first, second = (body.outline[1].sum() for body in found.bodies)
+    assert min(first, second) > 0.3 * (first + second)  # each has its side of the light
+
+
+def test_a_clump_between_two_galaxies_is_the_ones_to_whose_centre_it_is_far_nearer():
+    """It rises from the brighter one's light."""
+    faint, clump = np.array([60.0, 90.0]), (78, 80)
+    image = disk(16, 1500.0, (60, 30)) + disk(12, 200.0, faint) + point(clump, 200)
+    found = judged(image, [(60, 30), faint, clump])
+    assert len(found.bodies) == 2
+    assert found.owners[2] == found.owners[1] != found.owners[0]
+    assert found.body_at(np.array(clump)) == found.owners[1]
+
+
+@pytest.mark.parametrize("height, width, n_more", [(2e4, 0.9, 0), (20.0, 2.0, 4)])
+def test_what_a_stars_psf_leaves_is_no_source_but_what_a_galaxy_does_may_be(height, width, n_more):
+    """Four peaks of a quarter of the model's light, 5 pixels from a point or a galaxy."""
+    pytest.importorskip("sep")
+    from clresample.measurement.detection import detect_more
+
+    grid, psf = Grid.flat((SIZE, SIZE), 0.1), PSF.gaussian(0.8, n_pixels=15)
+    y, x = np.indices((SIZE, SIZE)) - MIDDLE[0]
+    square = y**2 + x**2
+    light = height * np.exp(-square / (2 * width**2)) + 40 / (1 + square / 30)
+    left = sum(point((60 + a, 60 + b), 16, 1.0) for a, b in ((5, 0), (-5, 0), (0, 5), (0, -5)))
+    o = Observation(light + left, psf, grid, weights=1.0)
+    component = Component(0, (0, 0), light / light.max(), np.array([light.max()]))
+    result = blend([component], observations=(o,), grid=grid)
+    assert len(detect_more(result).sources) == n_more
+
+
+def test_a_knot_beside_a_galaxys_light_is_in_its_group_inside_its_radius():
+    """Its disk is hidden there."""
+    knots, away = [(60, 81), (52, 80)], (60, 110)
+    image = disk(20)
+    image[:, 76:] = 0
+    image += sum(point(at, 100) for at in (*knots, away))
+    found = judged(image, [MIDDLE, *knots, away])
+    assert len(found.bodies) == 1
+    assert found.owners.tolist() == [0, 0, 0, -1]

@@ -16,9 +16,9 @@ from .reason import Cause
 # Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
 # light subtracted. Crowded pieces settle in the third or fourth round.
 ROUNDS = 4
-# The same for large pieces without new sources in their residuals, which take tens of seconds each
-# (fitting.LARGE). The first round subtracts their neighbours' light; the changes in later rounds
-# are smaller than the assumed error of that light.
+# The same for large pieces, which take tens of seconds each (fitting.LARGE). The first round
+# subtracts their neighbours' light; the changes in later rounds are smaller than the assumed error
+# of that light.
 LARGE_ROUNDS = 1
 # [errors] A blend's pieces have settled if no flux changes by more than this between two rounds.
 # Fits end within 0.2 of the minimum (Settings.enough), two of them within 0.3 of each other, so a
@@ -41,8 +41,8 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 def fit_all_groups(job, engine, progress):
     """Fits all groups that are not on disk yet, round by round.
 
-    A cut blend's pieces are fitted again as long as the fluxes of a neighbour change, and if their
-    residuals contained more sources.
+    A cut blend's pieces are fitted again with the new sources of their residuals, and then as long
+    as the fluxes of a neighbour change.
     returns the GroupResultsFiles, of which the last round of each patch is valid, and the parents
         of the cut blends whose pieces had not settled when the rounds ended
     """
@@ -57,7 +57,6 @@ def fit_all_groups(job, engine, progress):
     n_last = 0
     for n_round in range(1, ROUNDS + 1):
         again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
-        again |= history.new
         groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
@@ -101,22 +100,17 @@ def _file(job, name):
 
 
 class _PieceHistory:
-    """The files of results of a cut blend's pieces, round by round.
-
-    new: pieces in whose residuals the last round has found sources
-    """
+    """The files of results of a cut blend's pieces, round by round."""
 
     def __init__(self, job):
-        self.job, self.names, self.found, self.new = job, {}, {}, set()
+        self.job, self.names, self.found = job, {}, {}
 
     def add(self, names):
         """Adds a round: {name: patches} of its parts."""
-        self.new = set()
         for name in sorted(names):
             (table,) = _file(self.job, name).read("FOUND")
             for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
                 self.found.setdefault(row[0], []).append(row)
-                self.new.add(row[0])
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
