@@ -69,6 +69,13 @@ def print_stages(row):
     print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
 
 
+def print_host(row):
+    """Print the calling thread's milliseconds a scene by stage in one line below a row."""
+    print(
+        "  host: " + ", ".join(f"{k} {ms:.1f} ms" for k, ms in row["host_ms"].items()), flush=True
+    )
+
+
 def print_record(record):
     """Print a record, one name and value on each line."""
     for name, value in record.items():

@@ -116,9 +116,13 @@ class Device:
             self.upload(values, array)
         return array
 
-    def upload(self, values, array):
-        """Overwrites a device array with a C-contiguous NumPy array of its size and dtype."""
-        _copy(self, array.base_data, values, dst_offset=array.offset)
+    def upload(self, values, array, *, wait=True):
+        """Overwrites a device array with a C-contiguous NumPy array of its size and dtype.
+
+        wait: False only queues it; returns the event, which keeps the values until it is done:
+            hold it up to the next wait, since dropping it waits
+        """
+        return _copy(self, array.base_data, values, wait=wait, dst_offset=array.offset)
 
     def download(self, array, values):
         """Overwrites a C-contiguous NumPy array with a device array, once all queued is done."""
@@ -135,6 +139,16 @@ class Device:
         if values.size:
             self.download(array, values)
         return values
+
+    def get_all(self, arrays):
+        """The values of some arrays, as `get` gives them, with one wait for all."""
+        found = [np.empty(array.shape, array.dtype) for array in arrays]
+        pairs = [(v, array) for v, array in zip(found, arrays, strict=True) if v.size]
+        events = []  # each keeps its target; the last one ends after the others
+        for i, (values, array) in enumerate(pairs, 1):
+            places = {"src_offset": array.offset, "wait": i == len(pairs)}
+            events.append(_copy(self, values, array.base_data, **places))
+        return found
 
     def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
         """A Launcher of kernel `name` in kernels/`file`, no argument bound yet.
@@ -194,13 +208,19 @@ class Device:
         self.in_use -= n_bytes
 
 
-def _copy(device, target, source, **options):
-    """Queues a copy; one from or to the host has finished when this returns."""
+def _copy(device, target, source, *, wait=True, **options):
+    """Queues a copy and returns its event; one from or to the host has finished by then.
+
+    wait: False leaves out the wait for the host's
+    """
     import pyopencl as cl
 
-    event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
     if isinstance(target, np.ndarray) or isinstance(source, np.ndarray):
+        options["is_blocking"] = wait
+    event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
+    if options.get("is_blocking"):
         device._call(event.wait)
+    return event
 
 
 @functools.cache

@@ -198,7 +198,11 @@ def test_values_are_there_though_blocking_copies_come_back_early(device, monkeyp
     )
     slow = cl.Program(device.context, source).build().slow
     monkeypatch.setattr(cl, "enqueue_copy", early)
-    for read in (device.get, lambda array: _read_into(device, array)):
+    both = [
+        lambda array: device.get_all([y, array])[1],
+        lambda array: device.get_all([array, y])[0],
+    ]
+    for read in (device.get, lambda array: _read_into(device, array), *both):
         device.copy(y, x)
         slow(device.queue, (n,), None, x.base_data)
         np.testing.assert_array_equal(read(x)[-1000:], 1)
@@ -207,6 +211,9 @@ def test_values_are_there_though_blocking_copies_come_back_early(device, monkeyp
     device.upload(values, x)
     values[:] = 5  # the host's memory is the caller's again
     assert (device.get(x) == 3).all()
+    later = device.upload(values, x, wait=False)
+    assert (device.get_all([x, device.zeros(0, np.float32)])[0] == 5).all()
+    del later
     slow(device.queue, (n,), None, x.base_data)
     last = cl.enqueue_marker(device.queue)
     device.finish()

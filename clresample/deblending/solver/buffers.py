@@ -133,13 +133,13 @@ class SceneBuffers:
         return np.split(rows, self._ends[:-1])
 
     def unpack(self, flat):
-        """A flat device buffer on the host: for each scene, its sources' arrays (ny, nx)."""
-        arrays, starts = self.host_boxes.unpack(self.device.get(flat)), [0, *self._ends]
+        """A flat buffer's values: for each scene, its sources' arrays (ny, nx)."""
+        arrays, starts = self.host_boxes.unpack(flat), [0, *self._ends]
         return [arrays[a:b] for a, b in zip(starts, self._ends, strict=False)]
 
     def states(self, iterated, memories, n_steps) -> list[State]:
         """States of all scenes from device arrays like `iterated`, back on the host."""
-        latent, morph, spectra, sky = iterated
-        spectra, sky = (self.device.get(a).astype(float) for a in (spectra, sky))
+        latent, morph, *numbers = self.device.get_all(iterated)
+        spectra, sky = (values.astype(float) for values in numbers)
         parts = self.unpack(latent), self.unpack(morph), self.split(spectra), sky, memories
         return [State(*part, n_steps=n_steps) for part in zip(*parts, strict=True)]

@@ -59,8 +59,9 @@ class MultiscaleEngine:
             self.strengths = PriorStrengths(b, self._gradient, latents, prior, states)
             v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
-            weights = self.strengths.weights(np.concatenate([s.spectra for s in states]))
-            self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+            spectra = np.concatenate([s.spectra for s in states])
+            self.strengths.request_blocks(spectra, self.progress.n_rounds)
+            self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
         else:
             engine, keep = past
             self.progress, self.pairs = engine.progress.take(keep), engine.pairs.subset(keep)
@@ -69,7 +70,7 @@ class MultiscaleEngine:
             )
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
-            self.steps.take_blocks(self.strengths.blocks)
+        self.steps.take_blocks(self.strengths.schedule.blocks)
 
     def subset(self, keep):
         """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
@@ -88,7 +89,9 @@ class MultiscaleEngine:
 
         returns accepted (B,): scenes whose progress.loss is new
         """
-        p = self.progress
+        p, blocks = self.progress, self.strengths.take_blocks(self.progress.n_rounds)
+        if blocks is not None:
+            self.steps.take_blocks(blocks)
         sums, slope, loss = self._evaluate()
         accepted, stepped = p.accept_trials(loss, slope)
         new = np.flatnonzero(stepped)
@@ -111,9 +114,8 @@ class MultiscaleEngine:
         gradient.queue()
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
         v.pack_gradients(gradient.rows_pull, self._row0)
-        sums, slope, energy = self.steps.change()
-        rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
-        return sums, slope, rows + 0.5 * energy
+        sums, slope, energy, rows = self.steps.change(gradient.rows_loss)
+        return sums, slope, rows.sum(1, dtype=np.float64) + 0.5 * energy
 
     def _clear(self, asking):
         """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""
@@ -125,15 +127,16 @@ class MultiscaleEngine:
     def _energies(self, vector):
         """|z|^2 (S, J) of a vector, and the spectra (S, C) last taken."""
         self.structure.energy(vector)
-        energies, spectra = self.structure.energies, self.buffers.spectra
-        return tuple(self.device.get(a).astype(np.float64) for a in (energies, spectra))
+        both = self.device.get_all([self.structure.energies, self.buffers.spectra])
+        return tuple(values.astype(np.float64) for values in both)
 
     def _learn(self, due):
         """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
         energies, spectra = self._energies(self.vectors.x_new)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
+        self.strengths.request_blocks(spectra, self.progress.n_rounds, due)
         self._rest_others(self.progress.live)
-        self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+        self.steps.reweigh(self.strengths.light, weights)
         self.progress.record_strengths(due, moved, change)
         return self.steps.change()[0]  # its s and y go into spare slots
 
