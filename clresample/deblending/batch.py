@@ -31,8 +31,6 @@ LOG = logging.getLogger("clresample")
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
 # that they share batches: smaller ones make more batches, larger ones more padding to compute.
 PAD_PX = 16
-# [bytes] Device memory of the scenes of one batch, by default.
-MEMORY = 1 << 30
 # Components of the scenes of one batch: each is a group of work-items along the third axis of a
 # launch, of which GPUs take no more.
 MAX_SOURCES = 65_535
@@ -41,9 +39,6 @@ SCENES_A_PORTION = 1024
 # What says by itself what went wrong with one blend; other errors are named by their kind as well.
 # None of them is a reason to give up the other blends.
 ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
-# Sources that are started together at most: each takes up to 1 MB, profile and slopes as all
-# observations see them. A few dozen hide what a launch costs.
-START_SOURCES = 500
 
 # What a blend has that nothing is warned about: sources far from any light, and problems.
 NOTHING: tuple = ((), ())
@@ -93,7 +88,7 @@ def deblend(
 
 
 def deblend_many(
-    blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
+    blends, *, settings=None, device=None, dtype=np.float32, memory=None, progress=None
 ) -> list[Result | Failure]:
     """Fits many blends side by side, each with the result of a fit alone to float accuracy.
 
@@ -103,7 +98,8 @@ def deblend_many(
         DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     settings: see Settings; dtype: float32 or float64, of the fits
-    memory [bytes]: of the device for one group of scenes; GPUs hold the next group's data beside it
+    memory [bytes]: of the device for one group of scenes; None: 1 GiB on CPUs and a quarter of all
+        on GPUs, which hold the next group's data beside it
     progress: called with the number of blends done, after each group and each failure; True draws
         a bar in terminals and notebooks, and prints a line now and then where nobody looks
     returns a Result for each blend, in their order, or a Failure: it does not harm the others.
@@ -162,7 +158,8 @@ class _BatchRunner:
 
     def __init__(self, blends, device, *, settings, dtype, memory, pad):
         self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
-        self.pad, self.memory, self.tuning = pad, memory, Tuning.of(device, dtype)
+        self.pad, self.tuning = pad, Tuning.of(device, dtype)
+        self.memory = self.tuning.group_memory if memory is None else memory
         self.done: list[Result | Failure | None] = [None] * len(blends)
         self.warned = {}
 
@@ -199,7 +196,8 @@ class _BatchRunner:
             group.append((i, fit))
             n_sources = [len(f.fitted) for _, f in group]
             full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
-            full |= sum(n_sources) >= START_SOURCES or sum(n_sources) + n_sources[-1] > MAX_SOURCES
+            full |= sum(n_sources) >= self.tuning.start_sources
+            full |= sum(n_sources) + n_sources[-1] > MAX_SOURCES
             if full or len(group) >= self.tuning.n_scenes:
                 yield self._begun(waiting.pop(fit.signature))
         while waiting:
@@ -209,12 +207,12 @@ class _BatchRunner:
         return len(group), self._begin(group)
 
     def _begin(self, group):
-        """Starts a group of (index, Fit), one by one if the group fails; returns those started."""
+        """Starts a group of (index, Fit), by halves if the group fails; returns those started."""
         try:
             start_fits([fit for _, fit in group])
         except Exception as error:
             if len(group) > 1:
-                return [item for one in group for item in self._begin([one])]
+                return [item for half in _halves(group) for item in self._begin(half)]
             (i, fit), *_ = group
             self.done[i] = _failure(fit.blend, error)
             return []
@@ -243,7 +241,7 @@ class _BatchRunner:
             yield part
 
     def _try(self, group):
-        """Yields (index, Result or Failure) of a group, fitted one by one if the group fails."""
+        """Yields (index, Result or Failure) of a group, fitted by halves if the group fails."""
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:
@@ -255,9 +253,11 @@ class _BatchRunner:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
                 return
-            for item in group:
-                yield from self._try([item])
-                if item[1].status == INTERRUPTED:
+            for fit in fits:
+                fit.restart()
+            for half in _halves(group):
+                yield from self._try(half)
+                if any(fit.status == INTERRUPTED for _, fit in half):
                     return
             return
         for (i, _), fit, own in zip(group, fits, seen, strict=True):
@@ -265,6 +265,12 @@ class _BatchRunner:
                 yield i, fit.result(own)
             except Exception as error:
                 yield i, _failure(fit.blend, error)
+
+
+def _halves(group):
+    """The two halves of a group of several."""
+    middle = len(group) // 2
+    return group[:middle], group[middle:]
 
 
 def _checked(settings, dtype):

@@ -98,9 +98,6 @@ class Fit:
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.strength_estimates = [], ITERATION_LIMIT, None
-        self._best = _BestState(np.inf, None, None, self.shifts)
-        self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
     @property
@@ -122,8 +119,17 @@ class Fit:
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
-        self.scene, self.state = first_scene(self)
+        self._first_shifts = self.shifts
+        self.restart()
         self.seconds["setup"] += seconds + time.perf_counter() - began
+
+    def restart(self):
+        """Goes back to where `begin` left the fit, whatever has become of it since."""
+        self.shift(self._first_shifts)
+        self.scene, self.state = first_scene(self)
+        self.losses, self.status, self.strength_estimates = [], ITERATION_LIMIT, None
+        self._best = _BestState(np.inf, None, None, self.shifts)
+        self.last_steps = np.zeros_like(self.shifts)
 
     @property
     def sky_level(self) -> np.ndarray:

@@ -59,6 +59,10 @@ class Tuning:
         where the device has it: as fast as float32 on CPUs, which do half as many a second, not on
             GPUs
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
+    start_sources: sources of one group of scenes at most, each of which takes up to 1 MB at the
+        start, profile and slopes as all observations see them. Some dozens hide what a launch costs
+        on CPUs, a full batch on GPUs
+    group_memory [bytes]: of the device for one group of scenes, unless a caller says otherwise
     prefetch_groups: a group of fits is prepared and uploaded by a second thread while another
         iterates; where the device is the CPU itself, both would share its cores
     max_loop_iterations: iterations of all its loops that a work-item may make in one launch; None
@@ -86,6 +90,8 @@ class Tuning:
     vector_chunk: int
     use_folded: bool
     n_scenes: int
+    start_sources: int
+    group_memory: int
     prefetch_groups: bool
     max_loop_iterations: int | None
     memory: int
@@ -125,6 +131,8 @@ class Tuning:
                 vector_chunk=512,
                 use_folded=True,
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
+                start_sources=500,
+                group_memory=1 << 30,
                 prefetch_groups=False,
                 **shared,
             )
@@ -140,6 +148,8 @@ class Tuning:
             vector_chunk=4096,  # some for each work-item of a group
             use_folded=False,
             n_scenes=1024,
+            start_sources=8192,
+            group_memory=device.memory // 4,
             prefetch_groups=not device.simulated,
             **shared,
         )
