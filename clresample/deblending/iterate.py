@@ -223,7 +223,7 @@ class _LbfgsRun:
         """Updates the shifts of the fits (B,); converged fits continue."""
         if not which.any():
             return
-        states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
+        states, moved = self.engine.states(which), np.zeros(len(self.fits), bool)
         enough = self.settings.loss_tol * self.engine.progress.chi2()
         for i in np.flatnonzero(which):
             steps, gain = shift_steps(self.engine.scenes[i], states[i])
@@ -272,7 +272,7 @@ class _LbfgsRun:
         for i in np.flatnonzero(which & failed):
             self.exchanges[i] = None
         if new.any():
-            states, findings = engine.states(), engine.findings(new)
+            states, findings = engine.states(new), engine.findings(new)
             for i in np.flatnonzero(new):
                 given = engine.scenes[i], states[i], findings[i]
                 with contextlib.suppress(np.linalg.LinAlgError):
@@ -290,7 +290,7 @@ class _LbfgsRun:
 
     def settle(self, stop):
         """Stores the present state of the fits (B,) that stop here."""
-        states, p = self.engine.states(), self.engine.progress
+        states, p = self.engine.states(stop), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
             f, ended = self.fits[i], "diverged" if p.failed[i] else "converged"

@@ -150,6 +150,27 @@ class Device:
             events.append(_copy(self, values, array.base_data, **places))
         return found
 
+    def get_parts(self, array, parts):
+        """The values of a flat array in some parts; elsewhere they are undefined. One wait for all.
+
+        parts (n, 2): first and one-past-last elements of each
+        """
+        values, events, size = np.empty(array.shape, array.dtype), [], array.dtype.itemsize
+        parts = [(first, end) for first, end in joined(parts) if end > first]
+        for i, (first, end) in enumerate(parts, 1):
+            places = {"src_offset": array.offset + first * size, "wait": i == len(parts)}
+            events.append(_copy(self, values[first:end], array.base_data, **places))
+        return values
+
+    def put_parts(self, parts, array):
+        """Overwrites parts of a flat array, {first element: values}, with one wait for all."""
+        events, size = [], array.dtype.itemsize
+        parts = {first: values for first, values in parts.items() if len(values)}
+        for i, (first, values) in enumerate(parts.items(), 1):
+            places = {"dst_offset": array.offset + first * size, "wait": i == len(parts)}
+            values = np.ascontiguousarray(values, array.dtype)
+            events.append(_copy(self, array.base_data, values, **places))
+
     def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
         """A Launcher of kernel `name` in kernels/`file`, no argument bound yet.
 
@@ -206,6 +227,16 @@ class Device:
 
     def _freed(self, n_bytes):
         self.in_use -= n_bytes
+
+
+def joined(parts):
+    """Parts (first, end) of a line, those that touch as one, in their order."""
+    found: list[tuple[int, int]] = []
+    for first, end in np.asarray(parts).reshape(-1, 2).tolist():
+        if found and found[-1][1] == first:
+            first = found.pop()[0]
+        found.append((first, end))
+    return found
 
 
 def _copy(device, target, source, *, wait=True, **options):

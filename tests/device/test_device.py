@@ -225,3 +225,17 @@ def _read_into(device, array):
     values = np.zeros(array.shape, array.dtype)
     device.download(array, values)
     return values
+
+
+def test_parts_of_an_array_are_read_and_written_where_they_lie(device):
+    whole = np.arange(20, dtype=np.float32)
+    x = device.put(whole)
+    parts = [(1, 3), (3, 3), (3, 5), (18, 20)]
+    found = device.get_parts(x, parts)
+    assert found.shape == (20,) and device_module.joined(parts) == [(1, 5), (18, 20)]
+    at = [1, 2, 3, 4, 18, 19]
+    np.testing.assert_array_equal(found[at], whole[at])
+    assert device.get_parts(x, []).shape == (20,)
+    device.put_parts({4: np.array([-1.0, -2.0]), 9: np.zeros(0), 18: np.array([5.0])}, x)
+    whole[[4, 5, 18]] = -1, -2, 5
+    np.testing.assert_array_equal(device.get(x), whole)

@@ -17,7 +17,8 @@ class SceneBuffers:
 
     scenes, device, dtype, tuning: Scenes, Device, NumPy type, Tuning
     all_sources (n,): int32, the sources that are rendered, all of them
-    first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that
+    first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that;
+        host_first: the same of all sources, on the host
     boxes, host_boxes: of all sources, with and without their table on the device
     free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
     profile, amplitude, latent, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
@@ -29,8 +30,8 @@ class SceneBuffers:
         self.scenes, self.device, self.dtype = scenes, device, np.dtype(dtype)
         self.tuning = Tuning.of(device, dtype)
         counts = [len(s.origin) for s in scenes]
-        self._ends = np.cumsum(counts)
-        self.first = device.put(np.concatenate([[0], self._ends]), np.int32)
+        self.host_first = np.concatenate([[0], np.cumsum(counts)])
+        self.first = device.put(self.host_first, np.int32)
         self.host_boxes = Boxes(
             np.repeat(np.arange(len(scenes)), counts),
             np.concatenate([s.origin for s in scenes]),
@@ -130,12 +131,18 @@ class SceneBuffers:
 
     def split(self, rows):
         """Arrays (S, ...) of all sources, one part for each scene."""
-        return np.split(rows, self._ends[:-1])
+        return np.split(rows, self.host_first[1:-1])
 
     def unpack(self, flat):
         """A flat buffer's values: for each scene, its sources' arrays (ny, nx)."""
-        arrays, starts = self.host_boxes.unpack(flat), [0, *self._ends]
-        return [arrays[a:b] for a, b in zip(starts, self._ends, strict=False)]
+        arrays = self.host_boxes.unpack(flat)
+        return [arrays[a:b] for a, b in zip(self.host_first, self.host_first[1:])]
+
+    def morphologies(self, which):
+        """The morphologies of the scenes `which` (B,), likewise; of others without meaning."""
+        starts = np.append(self.host_boxes.offset, self.host_boxes.size)[self.host_first]
+        parts = np.stack([starts[:-1], starts[1:]], axis=1)[which]
+        return self.unpack(self.device.get_parts(self.morph, parts))
 
     def states(self, iterated, memories, n_steps) -> list[State]:
         """States of all scenes from device arrays like `iterated`, back on the host."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...resampling.resampler import Resampler
 from .rendering.stage_selection import select_rendering
+from .rendering.windows import WindowRendering
 
 
 class LossGradient:
@@ -28,13 +29,15 @@ class LossGradient:
     with_prior: whether the loss has the term of z
     depth: at which stage of rendering spectra are applied, see rendering/stages.py; None leaves it
         to each observation's count
+    before: LossGradient of a batch that had these scenes too, whose stages are taken; windows are
+        counted anew
     rows (C + 1,): observed rows of all channels up to each, the columns of:
     rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, in a channel's
         first one with what is expected of its sky; sums over its rows are its loss and dL/dsky
     best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
     """
 
-    def __init__(self, buffers, with_prior, depth=None):
+    def __init__(self, buffers, with_prior, depth=None, *, before=None):
         self.buffers, scenes = buffers, buffers.scenes
         heights = [op.shape_out[1] for op in scenes[0].ops for _ in range(op.shape_out[0])]
         self.rows = np.concatenate([[0], np.cumsum(heights)])
@@ -43,7 +46,11 @@ class LossGradient:
             buffers.device.empty(shape, buffers.dtype) for _ in range(2)
         )
         self.best = buffers.put(np.full(len(scenes), np.inf))
-        self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
+        depths = [depth] * len(scenes[0].ops)
+        if before is not None:
+            had = [o.rendering.depth for o in before.observations]
+            depths = [None if depth == WindowRendering.depth else depth for depth in had]
+        self.observations = [_ObservedBatch(self, i, depth) for i, depth in enumerate(depths)]
         self._with_prior, self._tie, self._expect_sky = with_prior, None, None
         known = np.array([scene.known_sky for scene in scenes])
         if known.any():

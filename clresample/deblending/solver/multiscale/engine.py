@@ -11,8 +11,6 @@ to 0.05, a twentieth of what ends a fit.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..buffers import SceneBuffers
@@ -47,7 +45,8 @@ class MultiscaleEngine:
     def __init__(self, scenes, states, device, dtype, prior, loss_tol, *, past=None):
         self.scenes, self._states, self.device, self.prior = scenes, states, device, prior
         b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
-        self._gradient = LossGradient(b, with_prior=False)
+        before = None if past is None else past[0]._gradient
+        self._gradient = LossGradient(b, with_prior=False, before=before)
         self.structure = StructureOperator(b, prior)
         latents = self.structure.latents
         v = self.vectors = SolverVectors(b, latents, N_PAIRS + 1)
@@ -144,13 +143,19 @@ class MultiscaleEngine:
         """Restricts the launches that follow to the scenes `live` (B,)."""
         self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
-    def states(self) -> list[State]:
-        """The scenes' present states, back on the host."""
-        b, v = self.buffers, self.vectors
+    def states(self, which=None) -> list[State]:
+        """The present states of the scenes `which` (B,), None: of all; None for the others."""
+        which = np.ones(len(self.scenes), bool) if which is None else which
+        b, v, n_steps = self.buffers, self.vectors, int(self.progress.n_rounds.max())
         self.structure.form(v.x)
-        v.unpack_spectra(v.x)
-        found = b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
-        return _that_learned(found, v.split(v.x), self.strengths.by_scene())
+        morphs, parts = b.morphologies(which), v.split(v.x, which)
+        found, known = [None] * len(which), self.strengths.by_scene()
+        for i in np.flatnonzero(which):
+            structure, spectra, sky = parts[i]
+            learned = StructureState(structure, *known[i])
+            given = self._states[i].latent, morphs[i], spectra, sky, None
+            found[i] = State(*given, n_steps=n_steps, learned=learned)
+        return found
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
@@ -159,7 +164,7 @@ class MultiscaleEngine:
 
     def slopes(self, which):
         """The SceneGradient of the scenes `which` (B,) where they are; None for the others."""
-        x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
+        x, g = (self.vectors.split(v, which) for v in (self.vectors.x, self.vectors.g))
         return [
             SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
             for now, slopes, on in zip(x, g, which, strict=True)
@@ -197,17 +202,6 @@ def _begins(latents, states):
         arrays += state.learned.structure if state.learned else [None] * len(state.morph)
     spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
     return latents.pack(arrays), spectra, sky
-
-
-def _that_learned(states, parts, known):
-    """States with structure and strengths; parts: see `SolverVectors.split`.
-
-    known: `PriorStrengths.by_scene`.
-    """
-    return [
-        replace(state, learned=StructureState(structure, *own))
-        for state, (structure, *_), own in zip(states, parts, known, strict=True)
-    ]
 
 
 def _n_pixels(scene):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ....device.multi_device import host_threads, map_threads
 from .block_schedule import BlockSchedule
 from .evidence import LocalPowerSpectra, SourceEvidence, blurred_light
 from .inverse import BlockPreconditioner
@@ -75,13 +76,16 @@ class PriorStrengths:
         answers, pixels = self._response.impulse_responses()
         pairs = zip(answers, pixels, strict=True)
         responses = [spectra.from_impulse_responses(*pair) for pair in pairs]
-        for s in self._free:
+
+        def prepare(s):
             evidence[s] = SourceEvidence(spectra, prior, profiles[s], responses[self._scene[s]])
             light[s] = [
                 blurred_light(profiles[s], sigma, step)
                 for sigma, step in zip(prior.scales_px, prior.steps, strict=True)
             ]
             inverses[s] = BlockPreconditioner(evidence[s], profiles[s], light[s])
+
+        map_threads(host_threads(self.buffers.device), prepare, self._free)
         return evidence, inverses, light
 
     def weights(self, spectra, due=None, change=0.0):

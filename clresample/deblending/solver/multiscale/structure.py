@@ -55,11 +55,15 @@ class LatentLayout:
                 out[self.start[s] : self.start[s] + len(flat)] = flat
         return out
 
-    def unpack(self, vector):
-        """Arrays [s][j] (ny_j, nx_j) of a vector (size or more,)."""
+    def unpack(self, vector, sources=slice(None)):
+        """Arrays [s][j] (ny_j, nx_j), float64, of some sources in a vector (size or more,)."""
+        places = zip(self.planes()[sources], self.shape[sources], strict=True)
         return [
-            [vector[a : a + n].reshape(shape) for (a, n), shape in zip(planes, shapes, strict=True)]
-            for planes, shapes in zip(self.planes(), self.shape, strict=True)
+            [
+                vector[a : a + n].reshape(shape).astype(np.float64)
+                for (a, n), shape in zip(planes, shapes, strict=True)
+            ]
+            for planes, shapes in places
         ]
 
 
