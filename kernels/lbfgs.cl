@@ -52,16 +52,21 @@ enum { MODE, USED, SPARE };
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-/* LANES running sums, and STORE_SUM: their total over a group into the table of sums. */
-#define SUMS(name) \
-    REAL name[LANES]; \
-    for (int l = 0; l < LANES; ++l) name[l] = 0;
-#define STORE_SUM(name, to) \
+/* LANES running sums; STORE_SUMS: N of them, each over its lanes and the group, into a table. */
+#define SUMS(name, N) \
+    REAL name[N][LANES]; \
+    for (int q = 0; q < (N); ++q) \
+        for (int l = 0; l < LANES; ++l) name[q][l] = 0;
+#define STORE_SUMS(name, N, to) \
     { \
-        REAL mine = 0; \
-        for (int l = 0; l < LANES; ++l) mine += name[l]; \
-        const REAL total = group_sum(mine, lid, share); \
-        if (lid == 0) to = total; \
+        REAL total[N]; \
+        for (int q = 0; q < (N); ++q) { \
+            total[q] = 0; \
+            for (int l = 0; l < LANES; ++l) total[q] += name[q][l]; \
+        } \
+        GROUP_SUMS(total, N, lid, share) \
+        if (lid == 0) \
+            for (int q = 0; q < (N); ++q) (to)[q] = total[q]; \
     }
 /* BODY for every element of this work-item: i, its lane l. */
 #define FOR_LANES(n, BODY) \
@@ -105,7 +110,7 @@ void inner_products(__global const int *restrict chunks, __global const int *res
             __global const REAL *restrict ring_s, __global const REAL *restrict ring_hy,
             __global REAL *restrict out)
 {
-    __local REAL share[WG];
+    __local REAL share[4 * WG];
     CHUNK
     if (PLAN(b, MODE) == REST) return;
     __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 2);
@@ -113,33 +118,25 @@ void inner_products(__global const int *restrict chunks, __global const int *res
     for (int k = 0; k < PLAN(b, USED); ++k) {
         __global const REAL *sk = ring_s + k * (size_t)size + first;
         __global const REAL *hyk = ring_hy + k * (size_t)size + first;
-        SUMS(s_g)
-        SUMS(y_g)
-        SUMS(s_y)
-        SUMS(y_y)
+        SUMS(sum, 4)
         FOR_LANES(n, {
             const REAL si = sk[i];
             const REAL hyi = hyk[i];
-            s_g[l] += si * p[i];
-            y_g[l] += hyi * p[i];
-            s_y[l] += si * dg[i];
-            y_y[l] += hyi * dg[i];
+            sum[0][l] += si * p[i];
+            sum[1][l] += hyi * p[i];
+            sum[2][l] += si * dg[i];
+            sum[3][l] += hyi * dg[i];
         })
-        STORE_SUM(s_g, to[4 * k])
-        STORE_SUM(y_g, to[4 * k + 1])
-        STORE_SUM(s_y, to[4 * k + 2])
-        STORE_SUM(y_y, to[4 * k + 3])
+        STORE_SUMS(sum, 4, to + 4 * k)
     }
     __global const REAL *weight = precision + first, *there = x_new + first;
     __global const REAL *s = ring_s + PLAN(b, SPARE) * (size_t)size + first;
-    SUMS(slope)
-    SUMS(energy)
+    SUMS(both, 2)   /* slope and energy */
     FOR_LANES(n, {
-        slope[l] += before[i] * s[i];
-        energy[l] += weight[i] * there[i] * there[i];
+        both[0][l] += before[i] * s[i];
+        both[1][l] += weight[i] * there[i] * there[i];
     })
-    STORE_SUM(slope, to[4 * SLOTS])
-    STORE_SUM(energy, to[4 * SLOTS + 1])
+    STORE_SUMS(both, 2, to + 4 * SLOTS)
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

@@ -1,13 +1,13 @@
 /* Work-items that share one box, and loops over the pixels of a row.
  *
  * WG work-items make a group, one group a source: they share its pixels, and meet at SYNC(). With
- * WG 1 there is no barrier at all, which suits CPUs; a GPU takes 64.
+ * WG 1 there is no barrier at all, which suits CPUs; a GPU takes 64, or 256 for long vectors.
  * FOR_X runs over a row of n pixels: all of them in one work-item (ROWS), or those of this one.
  * FOR_Y runs over those of n rows that are this work-item's, counted by a launch's second axis;
  * FOR_I over those of n items, by its first.  Any launch covers all of them, none goes beyond: a
  * launch is rounded up to whole groups.
  */
-#ifndef WG          /* work-items of a group */
+#ifndef WG          /* work-items of a group, a power of 2 */
 #define WG 1
 #endif
 #ifndef ROWS        /* 1: a work-item walks whole rows, which compilers for CPUs vectorise */
@@ -29,19 +29,29 @@
 #define FOR_Y(y, n) for (int y = (int)get_global_id(1); y < (n); y += (int)get_global_size(1))
 #define FOR_I(i, n) for (int i = (int)get_global_id(0); i < (n); i += (int)get_global_size(0))
 
-/* The sum of a group's values, in the order of its work-items and the same for each of them.
- * share: WG elements; all work-items must come here, with their lid = get_local_id(0). */
+/* The sums of each of N values over a group, by halves, the same for all of its work-items.
+ * share: N * WG elements; all work-items must come here, with their lid = get_local_id(0). */
+#if WG > 1
+#define GROUP_SUMS(values, N, lid, share) \
+    SYNC();                                  /* the values of an earlier sum have been read */ \
+    for (int q = 0; q < (N); ++q) share[q * WG + lid] = values[q]; \
+    for (int apart = WG / 2; apart > 0; apart /= 2) { \
+        SYNC(); \
+        if (lid < apart) \
+            for (int q = 0; q < (N); ++q) share[q * WG + lid] += share[q * WG + lid + apart]; \
+    } \
+    SYNC(); \
+    for (int q = 0; q < (N); ++q) values[q] = share[q * WG];
+#else
+#define GROUP_SUMS(values, N, lid, share)
+#endif
+
+/* The sum of one value, likewise; share: WG elements. */
 static REAL group_sum(const REAL value, const int lid, __local REAL *share)
 {
-    REAL total = value;
-#if WG > 1
-    SYNC();                                  /* the values of an earlier sum have been read */
-    share[lid] = value;
-    SYNC();
-    total = share[0];
-    for (int k = 1; k < WG; ++k) total += share[k];
-#endif
-    return total;
+    REAL total[1] = {value};
+    GROUP_SUMS(total, 1, lid, share)
+    return total[0];
 }
 
 /* The largest of a group's values, likewise. */

@@ -40,6 +40,8 @@ class Tuning:
     prefetch_columns: the contraction fetches the right factor's next columns while it multiplies.
         Without it, a CPU takes 15 to 20 % longer for a batch that is not in its cache
     sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
+    vector_group: likewise of one sum over a long vector, a box of a source or a block: more hide
+        more of each other's waits
     line_group: work-items of a group along an image row where a kernel has no loop of its own.
         Left to choose, CPU runtimes take another number for every image size and build the kernel
         anew for each, 0.1 to 0.3 s
@@ -78,6 +80,7 @@ class Tuning:
     row_loops: bool
     prefetch_columns: bool
     sum_group: int
+    vector_group: int
     line_group: int
     tile_group: tuple[int, int, int]
     item_group: tuple[int, int]
@@ -105,7 +108,7 @@ class Tuning:
     def untuned(cls, device, dtype=np.float32) -> Tuning:
         """Default sizes for a device that has not been measured."""
         shared = {
-            "line_group": 32,  # one warp of a GPU
+            "line_group": 64,  # two warps of a GPU, or a wave of AMD's
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
@@ -126,6 +129,7 @@ class Tuning:
                 tile_group=(8, 1, 1),  # fewer cost more in starting them, more are cut off
                 item_group=(1, 1),
                 sum_group=1,
+                vector_group=1,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
                 vector_chunk=512,
@@ -143,9 +147,10 @@ class Tuning:
             tile_group=(8, 8, 1),
             item_group=(32, 1),
             sum_group=64,  # what every GPU allows
+            vector_group=256 if device.cl.max_work_group_size >= 256 else 64,
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
-            vector_chunk=4096,  # some for each work-item of a group
+            vector_chunk=1024,  # four for each work-item of a group
             use_folded=False,
             n_scenes=1024,
             start_sources=8192,

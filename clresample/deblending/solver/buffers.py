@@ -97,10 +97,8 @@ class SceneBuffers:
             name,
             dtype=self.dtype,
             local_size=local_size or self.tuning.local_size(n_axes),
-            ROWS=self.tuning.row_loops,
-            WG=self.tuning.sum_group,
-            ALIGN=ALIGN,
-            **defines,
+            **{"ROWS": self.tuning.row_loops, "WG": self.tuning.sum_group, "ALIGN": ALIGN}
+            | defines,
         )
 
     def scene_launcher(self, name, local_size=None):

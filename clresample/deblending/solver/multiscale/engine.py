@@ -143,14 +143,15 @@ class MultiscaleEngine:
         """Restricts the launches that follow to the scenes `live` (B,)."""
         self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
-    def states(self, which=None) -> list[State]:
+    def states(self, which=None) -> list[State | None]:
         """The present states of the scenes `which` (B,), None: of all; None for the others."""
         which = np.ones(len(self.scenes), bool) if which is None else which
         b, v, n_steps = self.buffers, self.vectors, int(self.progress.n_rounds.max())
         self.structure.form(v.x)
         morphs, parts = b.morphologies(which), v.split(v.x, which)
-        found, known = [None] * len(which), self.strengths.by_scene()
-        for i in np.flatnonzero(which):
+        known = self.strengths.by_scene()
+        found: list[State | None] = [None] * len(which)
+        for i in np.flatnonzero(which).tolist():
             structure, spectra, sky = parts[i]
             learned = StructureState(structure, *known[i])
             given = self._states[i].latent, morphs[i], spectra, sky, None

@@ -34,10 +34,11 @@ class LbfgsSteps:
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
         shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
-        group = b.tuning.sum_group
+        group = b.tuning.vector_group
 
         def launcher(name, size=(group, 1)):
-            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
+            macros = {"SLOTS": n_slots, "WG": group}
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, **macros)
 
         self._trial = launcher("form_pairs").bind(
             **shared,
@@ -49,7 +50,7 @@ class LbfgsSteps:
             projected=projected,
             hg_new=hg_new,
         )
-        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL}
+        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
         self._invert = b.launcher(
             "block_inverse.cl", "apply_block_inverse", 2, local_size=size, **macros
         ).bind(plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new)

@@ -91,6 +91,7 @@ class StructureOperator:
             "STEPS": _list(prior.steps),
             "TAPS": n_taps,
             "MARGIN": margin,
+            "WG": b.tuning.vector_group,
         }
         rows = self.latents.shape[:, :, 0].sum(1)
         lines = np.maximum(rows, b.host_boxes.shape[:, 0])  # of condense, and of spread
@@ -104,7 +105,7 @@ class StructureOperator:
         placed = shared | {"start": b.device.put(start, np.int32)}
         sided = placed | {"taps": b.put(taps), "line": line}
         gauged = shared | {"inverse": b.put(inverse), "profile": b.profile, "morph": b.morph}
-        group = b.tuning.sum_group
+        group = b.tuning.vector_group
         launcher = b.launcher
         u = b.zeros_flat()
         self.energies = b.put(np.zeros((b.n_sources, self.n_scales)))
