@@ -52,22 +52,18 @@ enum { MODE, USED, SPARE };
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-/* LANES running sums; STORE_SUMS: N of them, each over its lanes and the group, into a table. */
-#define SUMS(name, N) \
-    REAL name[N][LANES]; \
-    for (int q = 0; q < (N); ++q) \
-        for (int l = 0; l < LANES; ++l) name[q][l] = 0;
-#define STORE_SUMS(name, N, to) \
-    { \
-        REAL total[N]; \
-        for (int q = 0; q < (N); ++q) { \
-            total[q] = 0; \
-            for (int l = 0; l < LANES; ++l) total[q] += name[q][l]; \
-        } \
-        GROUP_SUMS(total, N, lid, share) \
-        if (lid == 0) \
-            for (int q = 0; q < (N); ++q) (to)[q] = total[q]; \
-    }
+/* LANES running sums; ADD_LANES: their total in a private array's element q. */
+#define SUMS(name) \
+    REAL name[LANES]; \
+    for (int l = 0; l < LANES; ++l) name[l] = 0;
+#define ADD_LANES(name, total, q) \
+    total[q] = 0; \
+    for (int l = 0; l < LANES; ++l) total[q] += name[l];
+/* The group's sums of N totals into a table. */
+#define STORE_SUMS(total, N, to) \
+    GROUP_SUMS(total, N, lid, share) \
+    if (lid == 0) \
+        for (int q = 0; q < (N); ++q) (to)[q] = total[q];
 /* BODY for every element of this work-item: i, its lane l. */
 #define FOR_LANES(n, BODY) \
     for (int i0 = lid * LANES; i0 + LANES <= (n); i0 += WG * LANES) \
@@ -118,24 +114,36 @@ void inner_products(__global const int *restrict chunks, __global const int *res
     for (int k = 0; k < PLAN(b, USED); ++k) {
         __global const REAL *sk = ring_s + k * (size_t)size + first;
         __global const REAL *hyk = ring_hy + k * (size_t)size + first;
-        SUMS(sum, 4)
+        SUMS(s_g)
+        SUMS(y_g)
+        SUMS(s_y)
+        SUMS(y_y)
         FOR_LANES(n, {
             const REAL si = sk[i];
             const REAL hyi = hyk[i];
-            sum[0][l] += si * p[i];
-            sum[1][l] += hyi * p[i];
-            sum[2][l] += si * dg[i];
-            sum[3][l] += hyi * dg[i];
+            s_g[l] += si * p[i];
+            y_g[l] += hyi * p[i];
+            s_y[l] += si * dg[i];
+            y_y[l] += hyi * dg[i];
         })
-        STORE_SUMS(sum, 4, to + 4 * k)
+        REAL total[4];
+        ADD_LANES(s_g, total, 0)
+        ADD_LANES(y_g, total, 1)
+        ADD_LANES(s_y, total, 2)
+        ADD_LANES(y_y, total, 3)
+        STORE_SUMS(total, 4, to + 4 * k)
     }
     __global const REAL *weight = precision + first, *there = x_new + first;
     __global const REAL *s = ring_s + PLAN(b, SPARE) * (size_t)size + first;
-    SUMS(both, 2)   /* slope and energy */
+    SUMS(slope)
+    SUMS(energy)
     FOR_LANES(n, {
-        both[0][l] += before[i] * s[i];
-        both[1][l] += weight[i] * there[i] * there[i];
+        slope[l] += before[i] * s[i];
+        energy[l] += weight[i] * there[i] * there[i];
     })
+    REAL both[2];
+    ADD_LANES(slope, both, 0)
+    ADD_LANES(energy, both, 1)
     STORE_SUMS(both, 2, to + 4 * SLOTS)
 }
 

@@ -108,7 +108,6 @@ class Tuning:
     def untuned(cls, device, dtype=np.float32) -> Tuning:
         """Default sizes for a device that has not been measured."""
         shared = {
-            "line_group": 64,  # two warps of a GPU, or a wave of AMD's
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
@@ -130,6 +129,7 @@ class Tuning:
                 item_group=(1, 1),
                 sum_group=1,
                 vector_group=1,
+                line_group=32,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
                 vector_chunk=512,
@@ -147,6 +147,7 @@ class Tuning:
             tile_group=(8, 8, 1),
             item_group=(32, 1),
             sum_group=64,  # what every GPU allows
+            line_group=64,  # a wave of AMD's, two warps
             vector_group=256 if device.cl.max_work_group_size >= 256 else 64,
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
