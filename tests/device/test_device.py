@@ -57,6 +57,7 @@ def test_zeros_in_pieces(device, monkeypatch):
     np.testing.assert_array_equal(device.get(device.zeros(100, np.float32)), 0)
 
 
+@pytest.mark.counts_memory
 def test_memory_in_use_is_given_back(device):
     gc.collect()
     before = device.in_use
@@ -85,6 +86,7 @@ def test_a_full_device_says_so(device, monkeypatch):
         device.empty(26, np.float32)
 
 
+@pytest.mark.counts_memory
 @pytest.mark.parametrize("status", ["MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY"])
 def test_a_refused_allocation_names_both_sizes(device, monkeypatch, status):
     monkeypatch.setattr(device_module, "_buffer_type", lambda: lost(status))
