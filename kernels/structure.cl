@@ -178,9 +178,10 @@ __kernel void coefficients_to_image(__global const int *restrict active,
     const REAL total = group_sum(SUM8(part), lid, share);
 #else
 #define SUM_OVER(total, n, VALUE) \
-    REAL part = 0; \
-    for (int i = lid; i < (n); i += WG) part += VALUE; \
-    const REAL total = group_sum(part, lid, share);
+    REAL part[1] = {0}; \
+    for (int i = lid; i < (n); i += WG) part[0] += VALUE; \
+    GROUP_SUMS(part, 1, lid, share) \
+    const REAL total = part[0];
 #endif
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

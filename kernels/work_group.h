@@ -7,7 +7,7 @@
  * FOR_I over those of n items, by its first.  Any launch covers all of them, none goes beyond: a
  * launch is rounded up to whole groups.
  */
-#ifndef WG          /* work-items of a group, a power of 2 */
+#ifndef WG          /* work-items of a group */
 #define WG 1
 #endif
 #ifndef ROWS        /* 1: a work-item walks whole rows, which compilers for CPUs vectorise */
@@ -29,11 +29,26 @@
 #define FOR_Y(y, n) for (int y = (int)get_global_id(1); y < (n); y += (int)get_global_size(1))
 #define FOR_I(i, n) for (int i = (int)get_global_id(0); i < (n); i += (int)get_global_size(0))
 
-/* The sums of each of N values over a group, by halves, the same for all of its work-items.
- * share: N * WG elements; all work-items must come here, with their lid = get_local_id(0). */
+/* The sum of a group's values, in the order of its work-items and the same for each of them.
+ * share: WG elements; all work-items must come here, with their lid = get_local_id(0). */
+static REAL group_sum(const REAL value, const int lid, __local REAL *share)
+{
+    REAL total = value;
+#if WG > 1
+    SYNC();                                  /* the values of an earlier sum have been read */
+    share[lid] = value;
+    SYNC();
+    total = share[0];
+    for (int k = 1; k < WG; ++k) total += share[k];
+#endif
+    return total;
+}
+
+/* The sums of each of N values by halves, likewise, for groups of many; WG is a power of 2.
+ * share: N * WG elements. Not for loops that end by their values: PoCL crashes there. */
 #if WG > 1
 #define GROUP_SUMS(values, N, lid, share) \
-    SYNC();                                  /* the values of an earlier sum have been read */ \
+    SYNC(); \
     for (int q = 0; q < (N); ++q) share[q * WG + lid] = values[q]; \
     for (int apart = WG / 2; apart > 0; apart /= 2) { \
         SYNC(); \
@@ -45,14 +60,6 @@
 #else
 #define GROUP_SUMS(values, N, lid, share)
 #endif
-
-/* The sum of one value, likewise; share: WG elements. */
-static REAL group_sum(const REAL value, const int lid, __local REAL *share)
-{
-    REAL total[1] = {value};
-    GROUP_SUMS(total, 1, lid, share)
-    return total[0];
-}
 
 /* The largest of a group's values, likewise. */
 static REAL group_max(const REAL value, const int lid, __local REAL *share)
