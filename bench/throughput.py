@@ -13,6 +13,8 @@ wall_s              of the whole: set-up, fit, errors, result, catalogue
 galsim_ms           processor time of one GalSim quintic render of one band, EUCLID -> RUBIN at
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
+host_ms_a_scene     thread time of the calling thread, which a faster device would leave
+host_ms             of that by stage, likewise a scene; and the time of a round of learning
 stage               seconds of wall time by stage, as results have them, and of catalogues; of
                     results that threads make side by side, those of each
 peak_gb             largest memory of the process so far, all included; before the row: base_gb
@@ -38,6 +40,7 @@ from clresample import catalogue
 from .harness import records, scenes
 from .harness.clock import on_all_cores
 from .harness.crowded import crowded_blend
+from .harness.host import host_stages
 from .harness.options import ROOT, Parser, run
 
 N_SCENES, N_QUICK = 32, 8
@@ -52,7 +55,8 @@ WARM_SEED = 1000  # Of scenes that only have the kernels built before anything i
 WARM_BLEND = 3, 96  # Sources and pixels of a small blend for the same purpose.
 COLUMNS = records.columns(
     "what:6 n_scenes:8d n_sources:9d n_model:7d core_s_per_source:17.4f wall_s:7.2f "
-    "galsim_ms:9.3f renders_per_source:18.1f iterations:10.0f chi2:6.3f peak_gb:7.2f status:15"
+    "host_ms_a_scene:15.1f galsim_ms:9.3f renders_per_source:18.1f iterations:10.0f chi2:6.3f "
+    "peak_gb:7.2f status:15"
 )
 
 
@@ -61,13 +65,15 @@ def timed(what, blends, clock):
     base_gb = _peak_gb()
     clock.ticks(N_TICKS)
     wall_s, core_s = time.perf_counter(), time.process_time()
-    results = scenes.fit(blends)
-    for result in results:
-        if result.status == "failed":
-            raise RuntimeError(result.reason)
-    began = time.perf_counter()
-    n_sources = sum(len(catalogue(result)) for result in results)
-    ended = time.perf_counter()
+    with host_stages() as host:
+        results = scenes.fit(blends)
+        for result in results:
+            if result.status == "failed":
+                raise RuntimeError(result.reason)
+        began = time.perf_counter()
+        with host.stage("catalogue"):
+            n_sources = sum(len(catalogue(result)) for result in results)
+        ended = time.perf_counter()
     wall_s, core_s = ended - wall_s, time.process_time() - core_s
     clock.ticks(N_TICKS)
     galsim_ms = clock.take_ms()
@@ -82,6 +88,7 @@ def timed(what, blends, clock):
         "n_model": results[0].frame.shape[0],
         "core_s_per_source": core_s / n_sources,
         "wall_s": wall_s,
+        "host_ms_a_scene": 1e3 * host.seconds.total() / len(blends),
         "galsim_ms": galsim_ms,
         "renders_per_source": core_s / n_sources / galsim_ms * 1e3,
         "iterations": float(np.median([scenes.iterations(r) for r in results])),
@@ -89,6 +96,10 @@ def timed(what, blends, clock):
         "peak_gb": _peak_gb(),
         "base_gb": base_gb,
         "stage": {**stage, "catalogue": ended - began},
+        "host_ms": {
+            **{name: 1e3 * s / len(blends) for name, s in host.seconds.most_common()},
+            "learning round": 1e3 * host.mean_s("learn", "blocks"),
+        },
         "status": results[0].status if len(results) == 1 else f"{converged} converged",
     }
 
@@ -133,7 +144,7 @@ def blend_apart(n_sources, options, limit_s):
     """The same in a process of its own, which may fail, or last too long, without harm."""
     row = dict.fromkeys((name for name, *_ in COLUMNS), float("nan"))
     row |= {"what": "blend", "n_scenes": 1, "n_sources": n_sources, "n_model": BLENDS[n_sources]}
-    row |= {"base_gb": float("nan"), "stage": {}}
+    row |= {"base_gb": float("nan"), "stage": {}, "host_ms": {}}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "row.json"
         command = [sys.executable, "-m", "bench.throughput", "--blend", n_sources, "--json", file]

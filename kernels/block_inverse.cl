@@ -20,11 +20,9 @@
 #endif
 #define REST 0
 
-/* Row i of the root of a block: as long as the last one of its panel. */
-#define LENGTH(i) ((i) / PANEL * PANEL + PANEL)
-#define ROW(i) \
-    (root + (size_t)PANEL * PANEL * ((i) / PANEL) * ((i) / PANEL + 1) / 2 \
-     + (i) % PANEL * LENGTH(i))
+/* The first row of a panel, of rows as long as its last one: i, a multiple of PANEL. */
+#define ROW(i) (root + (size_t)PANEL * PANEL * ((i) / PANEL) * ((i) / PANEL + 1) / 2)
+#define COLUMNS (WG / PANEL)    /* work-items of a row; WG is a multiple of PANEL, but for ROWS */
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void apply_block_inverse(__global const int *restrict blocks, __global const int *restrict indices,
@@ -33,7 +31,12 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
             __global const REAL *restrict projected, __global REAL *restrict ring_hy,
             __global REAL *restrict hg_new)
 {
-    __local REAL ys[MAX_BLOCK], ps[MAX_BLOCK], wy[MAX_BLOCK], wp[MAX_BLOCK];
+    __local REAL ys[MAX_BLOCK], ps[MAX_BLOCK];
+#if ROWS
+    __local REAL wy[MAX_BLOCK], wp[MAX_BLOCK];
+#else
+    __local REAL row_y[WG], row_p[WG];
+#endif
     const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
     /* an idle scene has no variables here: PoCL crashes if a group returns before this SYNC */
     const int b = blocks[4 * block], m = plan[3 * b] == REST ? 0 : blocks[4 * block + 1];
@@ -100,26 +103,45 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
         hg_new[index[k]] = more ? hg_new[index[k]] + wp[k] : wp[k];
     }
 #else
-    for (int i = lid; i < n; i += WG) {
-        __global const REAL *row = ROW(i);
-        REAL sum_y = 0, sum_p = 0;
-        for (int k = 0; k <= i; ++k) {
-            sum_y += row[k] * ys[k];
-            sum_p += row[k] * ps[k];
+    /* A panel's rows side by side, COLUMNS work-items each, which read neighbours; their sums go down
+     * the same panel's columns, of which a work-item has every WG-th, while a cache holds them. */
+    const int row = lid / COLUMNS, column = lid % COLUMNS;
+    REAL sum_y[MAX_BLOCK / WG], sum_p[MAX_BLOCK / WG];
+    for (int q = 0; q < MAX_BLOCK / WG; ++q) sum_y[q] = sum_p[q] = 0;
+    __global const REAL *panel = root;
+    for (int length = PANEL; length <= n; panel += PANEL * length, length += PANEL) {
+        __global const REAL *mine = panel + row * length;
+        REAL of_y = 0, of_p = 0;
+        for (int k = column; k < length; k += COLUMNS) {
+            of_y += mine[k] * ys[k];
+            of_p += mine[k] * ps[k];
         }
-        wy[i] = sum_y;
-        wp[i] = sum_p;
+        SYNC();                             /* the sums of the panel before have been read */
+        row_y[lid] = of_y;
+        row_p[lid] = of_p;
+        for (int apart = COLUMNS / 2; apart > 0; apart /= 2) {
+            SYNC();
+            if (column < apart) {
+                row_y[lid] += row_y[lid + apart];
+                row_p[lid] += row_p[lid + apart];
+            }
+        }
+        SYNC();
+        for (int q = 0; q < MAX_BLOCK / WG; ++q) {
+            const int k = lid + q * WG;
+            if (k < length)
+                for (int r = 0; r < PANEL; ++r) {
+                    const REAL value = panel[r * length + k];
+                    sum_y[q] += value * row_y[r * COLUMNS];
+                    sum_p[q] += value * row_p[r * COLUMNS];
+                }
+        }
     }
-    SYNC();
-    for (int k = lid; k < m; k += WG) {     /* down columns: neighbours read neighbours */
-        REAL sum_y = 0, sum_p = 0;
-        for (int i = k; i < m; ++i) {
-            const REAL value = ROW(i)[k];
-            sum_y += value * wy[i];
-            sum_p += value * wp[i];
-        }
-        hy[index[k]] = more ? hy[index[k]] + sum_y : sum_y;
-        hg_new[index[k]] = more ? hg_new[index[k]] + sum_p : sum_p;
+    for (int q = 0; q < MAX_BLOCK / WG; ++q) {
+        const int k = lid + q * WG;
+        if (k >= m) continue;
+        hy[index[k]] = more ? hy[index[k]] + sum_y[q] : sum_y[q];
+        hg_new[index[k]] = more ? hg_new[index[k]] + sum_p[q] : sum_p[q];
     }
 #endif
 }

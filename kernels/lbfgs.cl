@@ -52,17 +52,18 @@ enum { MODE, USED, SPARE };
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-/* LANES running sums, and STORE_SUM: their total over a group into the table of sums. */
+/* LANES running sums; ADD_LANES: their total in a private array's element q. */
 #define SUMS(name) \
     REAL name[LANES]; \
     for (int l = 0; l < LANES; ++l) name[l] = 0;
-#define STORE_SUM(name, to) \
-    { \
-        REAL mine = 0; \
-        for (int l = 0; l < LANES; ++l) mine += name[l]; \
-        const REAL total = group_sum(mine, lid, share); \
-        if (lid == 0) to = total; \
-    }
+#define ADD_LANES(name, total, q) \
+    total[q] = 0; \
+    for (int l = 0; l < LANES; ++l) total[q] += name[l];
+/* The group's sums of N totals into a table. */
+#define STORE_SUMS(total, N, to) \
+    GROUP_SUMS(total, N, lid, share) \
+    if (lid == 0) \
+        for (int q = 0; q < (N); ++q) (to)[q] = total[q];
 /* BODY for every element of this work-item: i, its lane l. */
 #define FOR_LANES(n, BODY) \
     for (int i0 = lid * LANES; i0 + LANES <= (n); i0 += WG * LANES) \
@@ -105,7 +106,7 @@ void inner_products(__global const int *restrict chunks, __global const int *res
             __global const REAL *restrict ring_s, __global const REAL *restrict ring_hy,
             __global REAL *restrict out)
 {
-    __local REAL share[WG];
+    __local REAL share[4 * WG];
     CHUNK
     if (PLAN(b, MODE) == REST) return;
     __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 2);
@@ -125,10 +126,12 @@ void inner_products(__global const int *restrict chunks, __global const int *res
             s_y[l] += si * dg[i];
             y_y[l] += hyi * dg[i];
         })
-        STORE_SUM(s_g, to[4 * k])
-        STORE_SUM(y_g, to[4 * k + 1])
-        STORE_SUM(s_y, to[4 * k + 2])
-        STORE_SUM(y_y, to[4 * k + 3])
+        REAL total[4];
+        ADD_LANES(s_g, total, 0)
+        ADD_LANES(y_g, total, 1)
+        ADD_LANES(s_y, total, 2)
+        ADD_LANES(y_y, total, 3)
+        STORE_SUMS(total, 4, to + 4 * k)
     }
     __global const REAL *weight = precision + first, *there = x_new + first;
     __global const REAL *s = ring_s + PLAN(b, SPARE) * (size_t)size + first;
@@ -138,8 +141,10 @@ void inner_products(__global const int *restrict chunks, __global const int *res
         slope[l] += before[i] * s[i];
         energy[l] += weight[i] * there[i] * there[i];
     })
-    STORE_SUM(slope, to[4 * SLOTS])
-    STORE_SUM(energy, to[4 * SLOTS + 1])
+    REAL both[2];
+    ADD_LANES(slope, both, 0)
+    ADD_LANES(energy, both, 1)
+    STORE_SUMS(both, 2, to + 4 * SLOTS)
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

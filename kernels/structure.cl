@@ -164,8 +164,9 @@ __kernel void coefficients_to_image(__global const int *restrict active,
 #endif
 }
 
-/* sum_i VALUE over i < n by all work-items of a group, each of which gets it. Whole eights come
- * first: with a test of each i among them compilers do not vectorise. */
+/* sum_i VALUE over i < n by all work-items of a group, each of which gets it. Where a work-item has
+ * whole rows eights come first: with a test of each i among them compilers do not vectorise. */
+#if ROWS
 #define SUM_OVER(total, n, VALUE) \
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0}; \
     for (int i0 = 8 * lid; i0 + 8 <= (n); i0 += 8 * WG) \
@@ -175,6 +176,13 @@ __kernel void coefficients_to_image(__global const int *restrict active,
         } \
     for (int i = (n) / 8 * 8 + lid; i < (n); i += WG) part[0] += VALUE; \
     const REAL total = group_sum(SUM8(part), lid, share);
+#else
+#define SUM_OVER(total, n, VALUE) \
+    REAL part[1] = {0}; \
+    for (int i = lid; i < (n); i += WG) part[0] += VALUE; \
+    GROUP_SUMS(part, 1, lid, share) \
+    const REAL total = part[0];
+#endif
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void form_morphology(__global const int *restrict active, __global const int *restrict table,
@@ -212,7 +220,10 @@ void morphology_adjoint(__global const int *restrict active, __global const int 
     __global REAL *d = d_morph + box;
     SUM_OVER(along, n, (m[i] > 0 ? b[i] * d[i] : (REAL)0))
     const REAL less = along * inverse[s];
-    for (int i = lid; i < n; i += WG) d[i] = a[i] * ((m[i] > 0 ? d[i] : (REAL)0) - b[i] * less);
+    for (int i = lid; i < n; i += WG) {
+        const REAL di = m[i] > 0 ? d[i] : (REAL)0;
+        d[i] = a[i] * (di - b[i] * less);
+    }
 }
 
 __kernel void image_to_coefficients(__global const int *restrict active,

@@ -1,7 +1,7 @@
 /* Work-items that share one box, and loops over the pixels of a row.
  *
  * A group has WG work-items and one source, whose pixels they share; SYNC() is a barrier. With WG 1
- * there is no barrier, as is best for CPUs; GPUs use 64.
+ * there is no barrier, as is best for CPUs; GPUs use 64, or 256 for long vectors.
  * FOR_X runs over a row of n pixels: all of them in one work-item (ROWS), or those of this one.
  * FOR_Y runs over this work-item's share of n rows, by the second axis of the launch; FOR_I over
  * its share of n items, by the first axis.  A launch of any size covers all of them and no more, so
@@ -43,6 +43,23 @@ static REAL group_sum(const REAL value, const int lid, __local REAL *share)
 #endif
     return total;
 }
+
+/* The sums of each of N values by halves, likewise, for groups of many; WG is a power of 2.
+ * share: N * WG elements. Not for loops that end by their values: PoCL crashes there. */
+#if WG > 1
+#define GROUP_SUMS(values, N, lid, share) \
+    SYNC(); \
+    for (int q = 0; q < (N); ++q) share[q * WG + lid] = values[q]; \
+    for (int apart = WG / 2; apart > 0; apart /= 2) { \
+        SYNC(); \
+        if (lid < apart) \
+            for (int q = 0; q < (N); ++q) share[q * WG + lid] += share[q * WG + lid + apart]; \
+    } \
+    SYNC(); \
+    for (int q = 0; q < (N); ++q) values[q] = share[q * WG];
+#else
+#define GROUP_SUMS(values, N, lid, share)
+#endif
 
 /* The largest of a group's values, likewise. */
 static REAL group_max(const REAL value, const int lid, __local REAL *share)

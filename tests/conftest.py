@@ -109,8 +109,10 @@ def as_asked(request):
 
 
 @pytest.fixture(autouse=True)
-def within_buffers(as_asked):
+def within_buffers(request, as_asked):
     """With --guard-buffers: no kernel wrote beyond the end of a buffer."""
+    if as_asked is not None and request.node.get_closest_marker("counts_memory"):
+        pytest.skip("guarded buffers are larger, and stay until their test has ended")
     yield
     if as_asked is not None:
         assert as_asked.overwritten() == [], "bytes of buffers that were written beyond their end"

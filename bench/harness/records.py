@@ -81,9 +81,12 @@ def show(columns, found, record, path, *, summarise=None, below=None, order=None
 
 
 def print_stages(row):
-    """Print the seconds of a row's stages, where it has some, in one line below it."""
+    """Print the seconds of a row's stages, and the calling thread's milliseconds, where it has."""
     if row["stage"]:
         print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
+    if row.get("host_ms"):
+        stages = ", ".join(f"{name} {ms:.1f} ms" for name, ms in row["host_ms"].items())
+        print(f"  host: {stages}", flush=True)
 
 
 def print_lines(texts):

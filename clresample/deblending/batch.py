@@ -38,8 +38,6 @@ LOG = logging.getLogger("clresample")
 # [px] Frames and observations of blends of several sizes are padded to multiples of this number, so
 # that they share batches. A smaller one gives more batches, a larger one more padding to compute.
 PAD_PX = 16
-# [bytes] Device memory of the scenes of one batch, by default.
-MEMORY = 1 << 30
 # Largest number of components in a batch: each is a group of work-items along the third axis of a
 # launch, and this is the limit of GPUs.
 MAX_SOURCES = 65_535
@@ -48,9 +46,6 @@ SCENES_A_PORTION = 1024
 # Errors of a blend whose message is sufficient; for others the status names the class too. In
 # either case the other blends continue.
 ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
-# Largest number of sources started together: each takes up to 1 MB, for its profile and slopes in
-# all observations. A few dozen hide the cost of a launch.
-START_SOURCES = 500
 
 # A blend without warnings: no sources far from any light, and no problems.
 NOTHING: tuple = ((), ())
@@ -101,7 +96,7 @@ def deblend(
 
 
 def deblend_many(
-    blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
+    blends, *, settings=None, device=None, dtype=np.float32, memory=None, progress=None
 ) -> list[Result | Failure]:
     """Fits many blends side by side, each with the result of a fit alone to float accuracy.
 
@@ -111,7 +106,8 @@ def deblend_many(
         DeviceWarning names it and the others do its work
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     settings: Settings, or PaperSettings; dtype: float32 or float64, of the fits
-    memory [bytes]: of the device for one group of scenes; GPUs need memory for the next group too
+    memory [bytes]: of the device for one group of scenes; None = 1 GiB on CPUs and a quarter of all
+        memory on GPUs, which need memory for the next group too
     progress: called with the number of finished blends, after each group and each failure; True
         shows a progress bar in terminals and notebooks, and prints occasional lines elsewhere
     returns a Result for each blend, in their order, or a Failure, which does not affect the others.
@@ -170,7 +166,8 @@ class _BatchRunner:
 
     def __init__(self, blends, device, *, settings, dtype, memory, pad):
         self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
-        self.pad, self.memory, self.tuning = pad, memory, Tuning.of(device, dtype)
+        self.pad, self.tuning = pad, Tuning.of(device, dtype)
+        self.memory = self.tuning.group_memory if memory is None else memory
         self.done: list[Result | Failure | None] = [None] * len(blends)
         self.warned = {}
 
@@ -207,7 +204,8 @@ class _BatchRunner:
             group.append((i, fit))
             n_sources = [len(f.fitted) for _, f in group]
             full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
-            full |= sum(n_sources) >= START_SOURCES or sum(n_sources) + n_sources[-1] > MAX_SOURCES
+            full |= sum(n_sources) >= self.tuning.start_sources
+            full |= sum(n_sources) + n_sources[-1] > MAX_SOURCES
             if full or len(group) >= self.tuning.n_scenes:
                 yield self._begun(waiting.pop(fit.signature))
         while waiting:
@@ -217,12 +215,12 @@ class _BatchRunner:
         return len(group), self._begin(group)
 
     def _begin(self, group):
-        """Starts a group of (index, Fit), one by one if the group fails; returns those started."""
+        """Starts a group of (index, Fit), by halves if the group fails; returns those started."""
         try:
             start_fits([fit for _, fit in group])
         except Exception as error:
             if len(group) > 1:
-                return [item for one in group for item in self._begin([one])]
+                return [item for half in _halves(group) for item in self._begin(half)]
             (i, fit), *_ = group
             self.done[i] = _failure(fit.blend, error)
             return []
@@ -251,7 +249,7 @@ class _BatchRunner:
             yield part
 
     def _try(self, group):
-        """Yields (index, Result or Failure) of a group, fitted one by one if the group fails."""
+        """Yields (index, Result or Failure) of a group, fitted by halves if the group fails."""
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:
@@ -263,15 +261,23 @@ class _BatchRunner:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
                 return
-            for item in group:
-                yield from self._try([item])
-                if item[1].status == Ended.INTERRUPTED:
+            for fit in fits:
+                fit.restart()
+            for half in _halves(group):
+                yield from self._try(half)
+                if any(fit.status == Ended.INTERRUPTED for _, fit in half):
                     return
             return
         pairs = zip(fits, seen, strict=True)
         results = iterate_threads(host_threads(self.device), _result_or_failure, pairs)
         with contextlib.closing(results):
             yield from zip((i for i, _ in group), results, strict=True)
+
+
+def _halves(group):
+    """The two halves of a group of several."""
+    middle = len(group) // 2
+    return group[:middle], group[middle:]
 
 
 def _checked(settings, dtype):

@@ -80,8 +80,6 @@ class Fit:
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
-        self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
     @property
@@ -103,8 +101,16 @@ class Fit:
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
-        self.scene, self.state = first_scene(self)
+        self._first_shifts = self.shifts
+        self.restart()
         self.seconds["setup"] += seconds + time.perf_counter() - began
+
+    def restart(self):
+        """Restores the state of the fit at the end of `begin`."""
+        self.shift(self._first_shifts)
+        self.scene, self.state = first_scene(self)
+        self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
+        self.last_steps = np.zeros_like(self.shifts)
 
     @property
     def sky_level(self) -> np.ndarray:

@@ -133,7 +133,7 @@ class LbfgsRun:
         """Updates the shifts of the fits (B,); converged fits continue."""
         if not which.any():
             return
-        states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
+        states, moved = self.engine.states(which), np.zeros(len(self.fits), bool)
         enough = self.settings.loss_tol * self.engine.progress.chi2()
         for i in np.flatnonzero(which):
             steps, gain = shift_steps(self.engine.scenes[i], states[i])
@@ -196,7 +196,7 @@ class LbfgsRun:
 
     def _make_joint_steps(self, new):
         """Makes the joint steps of the fits `new` (B,), several at a time."""
-        states, findings = self.engine.states(), self.engine.findings(new)
+        states, findings = self.engine.states(new), self.engine.findings(new)
 
         def make(i):
             with contextlib.suppress(np.linalg.LinAlgError):
@@ -207,7 +207,7 @@ class LbfgsRun:
 
     def settle(self, stop):
         """Stores the present state of the fits (B,) that stop here."""
-        states, p = self.engine.states(), self.engine.progress
+        states, p = self.engine.states(stop), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
             f, ended = self.fits[i], Ended.DIVERGED if p.failed[i] else Ended.CONVERGED

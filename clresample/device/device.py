@@ -116,9 +116,13 @@ class Device:
             self.upload(values, array)
         return array
 
-    def upload(self, values, array):
-        """Overwrites a device array with a C-contiguous NumPy array of its size and dtype."""
-        _copy(self, array.base_data, values, dst_offset=array.offset)
+    def upload(self, values, array, *, wait=True):
+        """Overwrites a device array with a C-contiguous NumPy array of its size and dtype.
+
+        wait: False only queues it; returns the event, which keeps the values until it is done:
+            hold it up to the next wait, since dropping it waits
+        """
+        return _copy(self, array.base_data, values, wait=wait, dst_offset=array.offset)
 
     def download(self, array, values):
         """Overwrites a C-contiguous NumPy array with a device array, after all queued work."""
@@ -135,6 +139,37 @@ class Device:
         if values.size:
             self.download(array, values)
         return values
+
+    def get_all(self, arrays):
+        """The values of some arrays, as `get` gives them, with one wait for all."""
+        found = [np.empty(array.shape, array.dtype) for array in arrays]
+        pairs = [(v, array) for v, array in zip(found, arrays, strict=True) if v.size]
+        events = []  # each keeps its target; the last one ends after the others
+        for i, (values, array) in enumerate(pairs, 1):
+            places = {"src_offset": array.offset, "wait": i == len(pairs)}
+            events.append(_copy(self, values, array.base_data, **places))
+        return found
+
+    def get_parts(self, array, parts):
+        """The values of a flat array in some parts; elsewhere they are undefined. One wait for all.
+
+        parts (n, 2): first and one-past-last elements of each
+        """
+        values, events, size = np.empty(array.shape, array.dtype), [], array.dtype.itemsize
+        parts = [(first, end) for first, end in joined(parts) if end > first]
+        for i, (first, end) in enumerate(parts, 1):
+            places = {"src_offset": array.offset + first * size, "wait": i == len(parts)}
+            events.append(_copy(self, values[first:end], array.base_data, **places))
+        return values
+
+    def put_parts(self, parts, array):
+        """Overwrites parts of a flat array, {first element: values}, with one wait for all."""
+        events, size = [], array.dtype.itemsize
+        parts = {first: values for first, values in parts.items() if len(values)}
+        for i, (first, values) in enumerate(parts.items(), 1):
+            places = {"dst_offset": array.offset + first * size, "wait": i == len(parts)}
+            values = np.ascontiguousarray(values, array.dtype)
+            events.append(_copy(self, array.base_data, values, **places))
 
     def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
         """A Launcher of kernel `name` in kernels/`file`, no argument bound yet.
@@ -194,13 +229,29 @@ class Device:
         self.in_use -= n_bytes
 
 
-def _copy(device, target, source, **options):
-    """Queues a copy; one from or to the host has finished when this returns."""
+def joined(parts):
+    """Parts (first, end) of a line, those that touch as one, in their order."""
+    found: list[tuple[int, int]] = []
+    for first, end in np.asarray(parts).reshape(-1, 2).tolist():
+        if found and found[-1][1] == first:
+            first = found.pop()[0]
+        found.append((first, end))
+    return found
+
+
+def _copy(device, target, source, *, wait=True, **options):
+    """Queues a copy and returns its event; one from or to the host has finished by then.
+
+    wait: False leaves out the wait for the host's
+    """
     import pyopencl as cl
 
-    event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
     if isinstance(target, np.ndarray) or isinstance(source, np.ndarray):
+        options["is_blocking"] = wait
+    event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
+    if options.get("is_blocking"):
         device._call(event.wait)
+    return event
 
 
 @functools.cache

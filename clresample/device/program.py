@@ -178,7 +178,8 @@ class Launcher:
         self.device, self.kernel, self.local_size = device, kernel, local_size
         self._whole_groups = local_size is not None and max(local_size) > 1
         self._is_buffer, self._lock = is_buffer, lock
-        self._bound = dict.fromkeys(is_buffer, UNSET)  # in the kernel's order
+        self._place = {name: i for i, name in enumerate(is_buffer)}
+        self._bound = [UNSET] * len(is_buffer)  # in the kernel's order
 
     def bind(self, **arguments):
         """Binds arguments; returns the launcher. Raises ValueError for an unknown name."""
@@ -193,14 +194,14 @@ class Launcher:
         Raises ValueError for a name that the kernel does not have, for an argument that was never
         given, and for an array that does not start at its buffer's first byte.
         """
-        values = (self._merged(arguments) if arguments else self._bound).values()
+        values = self._merged(arguments) if arguments else self._bound
         with self._lock:
             try:
                 self.kernel.set_args(*values)
             except Exception as error:
-                unset = [n for n, v in zip(self._bound, values, strict=True) if v is UNSET]
+                unset = [n for n, v in zip(self._place, values, strict=True) if v is UNSET]
                 if not unset:
-                    error.add_note(f"arguments of {self!r}: {', '.join(self._bound)}")
+                    error.add_note(f"arguments of {self!r}: {', '.join(self._place)}")
                     raise
                 raise ValueError(f"{self!r} was not given {', '.join(unset)}") from error
             if self._whole_groups:
@@ -208,23 +209,25 @@ class Launcher:
             event = self.device.launch(self.kernel, global_size, self.local_size)
         profile = self.device.profile
         if profile is not None:
-            given = dict(zip(self._bound, values, strict=True))
+            given = dict(zip(self._place, values, strict=True))
             profile.record(event, self.kernel.function_name, given, global_size)
 
     def _merged(self, arguments):
+        """The bound values with these in their places; a list, since it is made at every launch."""
+        values, place = self._bound.copy(), self._place
         for name, value in arguments.items():
-            if self._is_buffer.get(name) and hasattr(value, "base_data"):
+            if name not in place:
+                unknown = ", ".join(arguments.keys() - place.keys())
+                raise ValueError(f"{self!r} takes {', '.join(place)}, not {unknown}")
+            if self._is_buffer[name] and hasattr(value, "base_data"):
                 if value.offset:
                     raise ValueError(
                         f"{name} of {self!r} starts at byte {value.offset} of its buffer: kernels "
                         "need arrays that start at byte 0"
                     )
-                arguments[name] = value.base_data
-        merged = self._bound | arguments
-        if len(merged) != len(self._bound):
-            unknown = ", ".join(arguments.keys() - self._bound.keys())
-            raise ValueError(f"{self!r} takes {', '.join(self._bound)}, not {unknown}")
-        return merged
+                value = value.base_data
+            values[place[name]] = value
+        return values
 
     def __repr__(self):
         return f"Launcher({self.kernel.function_name})"

@@ -36,6 +36,8 @@ class Tuning:
     prefetch_columns: the contraction fetches the right factor's next columns while it multiplies.
         Without it, a CPU takes 15 to 20 % longer for a batch that is not in its cache
     sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
+    vector_group: the same for one sum over a long vector, a box of a source or a block; more
+        work-items hide more of the memory's latency
     line_group: work-items of a group along an image row, for kernels without a loop. If it is not
         set, CPU runtimes choose another number for each image size and build the kernel again each
         time, which takes 0.1 to 0.3 s
@@ -55,6 +57,10 @@ class Tuning:
         middles. On CPUs with float64 that is as fast as float32, since it needs half of the
         products and float64 has half the speed; on GPUs it is slower
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
+    start_sources: largest number of sources of one group of scenes, each of which takes up to 1 MB
+        at the start, for its profile and slopes in all observations. A few dozen hide the cost of a
+        launch on CPUs, a full batch on GPUs
+    group_memory [bytes]: of the device for one group of scenes, by default
     prefetch_groups: a second thread prepares and uploads a group of fits while another group
         iterates; False if the device is the CPU, whose cores both would share
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
@@ -68,6 +74,7 @@ class Tuning:
     row_loops: bool
     prefetch_columns: bool
     sum_group: int
+    vector_group: int
     line_group: int
     tile_group: tuple[int, int, int]
     item_group: tuple[int, int]
@@ -80,6 +87,8 @@ class Tuning:
     vector_chunk: int
     use_folded: bool
     n_scenes: int
+    start_sources: int
+    group_memory: int
     prefetch_groups: bool
     memory: int
 
@@ -92,7 +101,6 @@ class Tuning:
     def untuned(cls, device, dtype=np.float32) -> Tuning:
         """Default sizes for a device that has not been measured."""
         shared = {
-            "line_group": 32,  # one warp of a GPU
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
@@ -112,11 +120,15 @@ class Tuning:
                 tile_group=(8, 1, 1),  # fewer groups start slower, larger ones waste work-items
                 item_group=(1, 1),
                 sum_group=1,
+                vector_group=1,
+                line_group=32,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
                 vector_chunk=512,
                 use_folded=True,
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
+                start_sources=500,
+                group_memory=1 << 30,
                 prefetch_groups=False,
                 **shared,
             )
@@ -127,11 +139,15 @@ class Tuning:
             tile_group=(8, 8, 1),
             item_group=(32, 1),
             sum_group=64,  # what every GPU allows
+            line_group=64,  # a wave of AMD's, two warps
+            vector_group=256 if device.cl.max_work_group_size >= 256 else 64,
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
-            vector_chunk=4096,  # some for each work-item of a group
+            vector_chunk=1024,  # four for each work-item of a group
             use_folded=False,
             n_scenes=1024,
+            start_sources=8192,
+            group_memory=device.memory // 4,
             prefetch_groups=not device.simulated,
             **shared,
         )

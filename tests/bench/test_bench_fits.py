@@ -16,7 +16,8 @@ COVERAGE = {
 }  # fmt: skip
 THROUGHPUT = {
     "what", "n_scenes", "n_sources", "n_model", "core_s_per_source", "wall_s", "galsim_ms",
-    "renders_per_source", "iterations", "chi2", "peak_gb", "base_gb", "stage", "status",
+    "host_ms_a_scene", "host_ms", "renders_per_source", "iterations", "chi2", "peak_gb",
+    "base_gb", "stage", "status",
 }  # fmt: skip
 REAL = {
     "scene", "band", "chi2", "status", "seconds", "core_s", "iterations", "n_sources", "residual",
@@ -184,6 +185,9 @@ def test_throughput(tmp_path):
         assert row["stage"].keys() >= {"setup", "fit", "result", "catalogue"}
         assert sum(row["stage"].values()) <= 1.01 * row["wall_s"]
         assert 0 < row["base_gb"] <= row["peak_gb"]
+        assert row["host_ms"].keys() >= {"start", "iterate", "learn", "errors", "catalogue"}
+        stages = sum(row["host_ms"].values()) - row["host_ms"]["learning round"]
+        assert 0 < row["host_ms_a_scene"] == pytest.approx(stages)
     assert rows[2]["status"] == "over 0.1 s"
     assert rows[2]["core_s_per_source"] is None
 

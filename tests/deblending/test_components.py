@@ -176,7 +176,7 @@ def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
         return
     n_same = min(map(len, (plain.losses, tried.losses))) // 2
     np.testing.assert_array_equal(tried.losses[:n_same], plain.losses[:n_same])
-    assert tried.losses[-1] == pytest.approx(plain.losses[-1], abs=1)
+    assert tried.losses[-1] < plain.losses[-1] + 1  # it may go further, from another memory
 
 
 def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):

@@ -174,6 +174,7 @@ def test_the_budget_counts_what_a_scene_takes(device):
     assert 0.5 * counted < used < 2 * counted
 
 
+@pytest.mark.counts_memory
 def test_device_memory_stays_constant(device, monkeypatch):
     """Over 64 blends in groups of 8, with PSFs and so operators of their own now and then."""
     tune(monkeypatch, n_scenes=8)

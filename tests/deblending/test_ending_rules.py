@@ -15,6 +15,9 @@ from clresample.paper.run import FitTrack
 class Named(SimpleNamespace):
     """A fit that is no more than its name; those called bad fail together with all others."""
 
+    def restart(self):
+        self.restarts = getattr(self, "restarts", 0) + 1
+
     def result(self, seen):
         if self.name == "late":
             raise ValueError("no result")
@@ -90,14 +93,26 @@ def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
     assert many._fit(group) is False and many.done == ["a seen 2", "b seen 2"] and seconds == [2]
 
 
+def test_a_group_that_fails_is_halved(monkeypatch):
+    """Of 64 fits the bad one is found in six steps, and 1, 2, 4 ... others go on together."""
+    many, group, sizes = many_of([*"a" * 40, "bad", *"b" * 23], monkeypatch)
+    assert many._fit(group) is False
+    assert sorted(sizes) == [1, 2, 4, 8, 16, 32]
+    assert [i for i, done in enumerate(many.done) if isinstance(done, Failure)] == [40]
+    assert [fit.restarts for _, fit in group] == [1] * 32 + [3] * 8 + [6] + [6] + [5] * 2 + [
+        4
+    ] * 4 + [2] * 16
+
+
 def test_nothing_more_is_begun_once_a_fit_was_interrupted(monkeypatch):
     """No second components, and no later part."""
     many, group, seconds = many_of(["a", "stop", "c"], monkeypatch, memory=2)
     assert many._fit(group) is True
     assert many.done == ["a seen 2", "stop seen 2", None] and seconds == []
     many, group, seconds = many_of(["bad", "a", "stop", "c"], monkeypatch)
-    assert many._fit(group) is True  # one by one
-    assert isinstance(many.done[0], Failure) and many.done[1:] == ["a seen 1", "stop seen 1", None]
+    assert many._fit(group) is True  # by halves
+    assert isinstance(many.done[0], Failure)
+    assert many.done[1:] == ["a seen 1", "stop seen 2", "c seen 2"]
     assert seconds == [1]
 
 

@@ -95,7 +95,7 @@ def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None,
     many = object.__new__(_BatchRunner)
     many.blends, many.done, many.memory = [None] * n, [None] * n, memory
     many.settings = many.device = many.dtype = many.pad = None
-    many.tuning = SimpleNamespace(n_scenes=n_scenes)
+    many.tuning = SimpleNamespace(n_scenes=n_scenes, start_sources=500)
     many._begun = lambda group: [fit.number for _, fit in group]
     return list(many._groups())
 
@@ -119,7 +119,6 @@ def test_groups_fill_up():
         assert fits(3, patch, n_bytes=251) == [[0, 1, 2]]
         assert fits(4, patch, n_bytes=334) == [[0, 1], [2, 3]]
         assert fits(3, patch, n_bytes=2000) == [[0], [1], [2]]
-        assert batch.START_SOURCES == 500
         assert fits(5, patch, sources=250) == [[0, 1], [2, 3], [4]]
         assert fits(4, patch, sources=249) == [[0, 1, 2], [3]]
         patch.setattr(batch, "MAX_SOURCES", 9)

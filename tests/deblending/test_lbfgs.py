@@ -260,7 +260,7 @@ def test_other_strengths_reach_every_vector(build, dtype):
     m = Made(build, dtype)
     light = np.random.default_rng(2).uniform(1, 2, m.latents.size)
     weights = np.random.default_rng(3).uniform(1, 2, (len(m.b.host_boxes), 3, 3))
-    m.steps.reweigh(m.b.put(light), weights, [[] for _ in weights])
+    m.steps.reweigh(m.b.put(light), weights)
     names = "h", "g_new", "precision"
     h, g, stiff = (m.host[name].copy() for name in names)
     for i, planes in enumerate(m.latents.planes()):

@@ -14,6 +14,7 @@ from clresample.deblending.solver.multiscale.engine import (
     vector_bytes,
 )
 from clresample.deblending.solver.multiscale.lbfgs_control import (
+    COMMON_ROUNDS,
     CONVERGENCE_WINDOW,
     FIRST_STRENGTH_ROUND,
     LONGEST,
@@ -155,17 +156,23 @@ def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
 
 
 def test_strengths_are_learned_at_once_where_little_is_left_to_gain():
-    """Where three iterations have gained less than 5; and not again before
-    three more."""
+    """Where three iterations have gained less than 5, in rounds that are multiples of four; and
+    not again before three more."""
     progress, due, loss = LbfgsControl(1, 0.5, [100]), [], 50.0
-    for i, drop in enumerate([0, 9, 3, 2, 0.5, 2.0, 0.1, 0.1, 0.1, 0.1]):
+    for i, drop in enumerate([9, 9, 9, 3, 1, 0.5, 0.1, 0.1, 9, 0.1, 0.1, 0.1, 0.1], 1):
         loss -= drop
         accepted, _ = progress.accept_trials(np.array([loss]), np.array([-1e-6]))
         if progress.strengths_due(accepted)[0]:
             due.append(i)
             progress.record_strengths(np.array([True]), np.array([0.2]), np.zeros(1))
         progress.next_actions(accepted)
-    assert due == [5, 8]
+    assert due == [8, 12]
+
+
+def test_a_scene_that_is_stuck_learns_in_any_round():
+    progress = begun(10.0)
+    progress._due[0] = 0
+    assert progress.n_rounds[0] % COMMON_ROUNDS and progress.strengths_due(np.array([True]))[0]
 
 
 @pytest.mark.parametrize("due", [(True, False), (False, True), (True, True), (False, False)])
@@ -176,7 +183,9 @@ def test_a_scene_learns_when_it_is_due_though_others_are_not(due):
         strengths_due=lambda _: np.array(due),
         significance_due=lambda _: np.zeros(2, bool),
         next_actions=lambda _: (None, None, None),
+        n_rounds=np.zeros(2, int),
     )
+    one.strengths = SimpleNamespace(take_blocks=lambda _: None)
     one.pairs = SimpleNamespace(
         take=lambda *_: None, forget=lambda _: None, coefficients=lambda *_: (None, None, None)
     )

@@ -33,7 +33,8 @@ def test_a_scene_with_clear_structure_learns_again(clear):
     one.strengths = SimpleNamespace(
         find_significant=lambda which, *given: (
             asked.append((which.tolist(), given)) or np.array([clear, False])
-        )
+        ),
+        take_blocks=nothing,
     )
     one.pairs = SimpleNamespace(
         take=nothing, forget=nothing, coefficients=lambda *_: (None, None, None)

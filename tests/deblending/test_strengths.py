@@ -122,9 +122,9 @@ def test_weights_are_those_of_each_source(build):
     found = m.strengths.weights(m.spectra)
     np.testing.assert_allclose(found[..., 0], np.tile(np.power(m.prior.strengths, -2.0), (9, 1)))
     np.testing.assert_allclose(found[..., 1], m.curvature(m.spectra), rtol=1e-6)
-    assert not found[..., 2].any() and [m.strengths.blocks[i] for i in np.flatnonzero(m.fixed)] == [
-        []
-    ]
+    assert not found[..., 2].any() and all(
+        m.strengths.schedule.blocks[i] == [] for i in np.flatnonzero(m.fixed)
+    )
     due, change = np.array([False, False, True]), np.random.default_rng(0).random((9, 3))
     found = m.strengths.weights(3 * m.spectra, due, change)
     wanted = np.where(due[m.scene][:, None], 9, 1) * m.curvature(m.spectra)
@@ -205,7 +205,8 @@ def test_scenes_that_go_on_alone_keep_their_strengths(build):
     np.testing.assert_array_equal(part.values, m.strengths.values[kept])
     np.testing.assert_array_equal(part.significant, m.strengths.significant[kept])
     np.testing.assert_allclose(build.get(part.precision), part.values**-2)
-    assert [id(own) for own in part.blocks] == [id(m.strengths.blocks[i]) for i in kept]
+    whole, own = m.strengths.schedule.blocks, part.schedule.blocks
+    assert [id(some) for some in own] == [id(whole[i]) for i in kept]
     nobody = np.zeros(2, bool)
     found, whole = (
         part.weights(m.spectra[kept], nobody),

@@ -86,6 +86,7 @@ def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
     assert guards.overwritten() == []
 
 
+@pytest.mark.counts_memory
 def test_memory_is_that_of_a_line_for_each_row(build):
     """Besides one array of all boxes: rows of coefficients, padded to vectors and by the kernels'
     radii and steps. Also where a kernel is a pixel longer than vectors."""

@@ -57,6 +57,7 @@ def test_zeros_in_pieces(device, monkeypatch):
     np.testing.assert_array_equal(device.get(device.zeros(100, np.float32)), 0)
 
 
+@pytest.mark.counts_memory
 def test_memory_in_use_is_given_back(device):
     gc.collect()
     before = device.in_use
@@ -85,6 +86,7 @@ def test_a_full_device_says_so(device, monkeypatch):
         device.empty(26, np.float32)
 
 
+@pytest.mark.counts_memory
 @pytest.mark.parametrize("status", ["MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY"])
 def test_a_refused_allocation_names_both_sizes(device, monkeypatch, status):
     monkeypatch.setattr(device_module, "_buffer_type", lambda: lost(status))
@@ -198,7 +200,11 @@ def test_values_are_there_though_blocking_copies_come_back_early(device, monkeyp
     )
     slow = cl.Program(device.context, source).build().slow
     monkeypatch.setattr(cl, "enqueue_copy", early)
-    for read in (device.get, lambda array: _read_into(device, array)):
+    both = [
+        lambda array: device.get_all([y, array])[1],
+        lambda array: device.get_all([array, y])[0],
+    ]
+    for read in (device.get, lambda array: _read_into(device, array), *both):
         device.copy(y, x)
         slow(device.queue, (n,), None, x.base_data)
         np.testing.assert_array_equal(read(x)[-1000:], 1)
@@ -207,6 +213,9 @@ def test_values_are_there_though_blocking_copies_come_back_early(device, monkeyp
     device.upload(values, x)
     values[:] = 5  # the host's memory is the caller's again
     assert (device.get(x) == 3).all()
+    later = device.upload(values, x, wait=False)
+    assert (device.get_all([x, device.zeros(0, np.float32)])[0] == 5).all()
+    del later
     slow(device.queue, (n,), None, x.base_data)
     last = cl.enqueue_marker(device.queue)
     device.finish()
@@ -218,3 +227,17 @@ def _read_into(device, array):
     values = np.zeros(array.shape, array.dtype)
     device.download(array, values)
     return values
+
+
+def test_parts_of_an_array_are_read_and_written_where_they_lie(device):
+    whole = np.arange(20, dtype=np.float32)
+    x = device.put(whole)
+    parts = [(1, 3), (3, 3), (3, 5), (18, 20)]
+    found = device.get_parts(x, parts)
+    assert found.shape == (20,) and device_module.joined(parts) == [(1, 5), (18, 20)]
+    at = [1, 2, 3, 4, 18, 19]
+    np.testing.assert_array_equal(found[at], whole[at])
+    assert device.get_parts(x, []).shape == (20,)
+    device.put_parts({4: np.array([-1.0, -2.0]), 9: np.zeros(0), 18: np.array([5.0])}, x)
+    whole[[4, 5, 18]] = -1, -2, 5
+    np.testing.assert_array_equal(device.get(x), whole)

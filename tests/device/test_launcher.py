@@ -80,6 +80,7 @@ def test_unknown_kernels_and_types_are_refused(device, kernels):
         device.launcher("absent.cl", "mixed")
 
 
+@pytest.mark.counts_memory
 def test_bound_arrays_stay_and_those_of_a_call_do_not(device, kernels, mixed):
     gc.collect()
     before = device.in_use

@@ -52,7 +52,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
     engine = SimpleNamespace(
         progress=progress,
         scenes=[f"scene {i}" for i in range(n)],
-        states=lambda: [f"state {i}" for i in range(n)],
+        states=lambda _: [f"state {i}" for i in range(n)],
         findings=lambda which: [f"findings {i}" if on else None for i, on in enumerate(which)],
         followed=[],
     )

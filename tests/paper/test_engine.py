@@ -148,6 +148,7 @@ def test_signatures_tell_what_can_share_a_batch(device):
         assert changed(scene, state, **other)[0].batch_key != scene.batch_key
 
 
+@pytest.mark.counts_memory
 def test_engines_leave_nothing_on_the_device(device):
     pairs = ragged(device, np.float32)
     held = []

@@ -157,6 +157,7 @@ def test_what_entries_have_grown_by_is_found_out():
     assert len(store) <= 16 and store.find(55, None) is not first[-1]
 
 
+@pytest.mark.counts_memory
 def test_caches_are_bounded(device, monkeypatch):
     """More geometries than are kept: the device's memory stops growing."""
     monkeypatch.setattr(

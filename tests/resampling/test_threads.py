@@ -52,6 +52,7 @@ def test_device_arrays_in_several_threads(device):
     assert in_threads(wrong) == [0] * N_THREADS
 
 
+@pytest.mark.counts_memory
 def test_memory_is_counted_right_in_threads(device):
     gc.collect()  # of earlier tests, whose memory would be given back meanwhile
     before = device.in_use

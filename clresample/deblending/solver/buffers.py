@@ -6,7 +6,6 @@ import numpy as np
 
 from ...device.tuning import Tuning
 from .boxes import ALIGN, Boxes
-from .scene import State
 
 # Items of a work-item on CPUs: PoCL takes 50 ns to start one, the time of many items.
 ITEMS_EACH = 64
@@ -17,7 +16,8 @@ class SceneBuffers:
 
     scenes, device, dtype, tuning: Scenes, Device, NumPy type, Tuning
     all_sources (n,): int32, the sources that are rendered, all of them
-    first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that
+    first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that;
+        host_first: the same of all sources, on the host
     boxes, host_boxes: of all sources, with and without their table on the device
     free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
     profile, amplitude, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
@@ -29,8 +29,8 @@ class SceneBuffers:
         self.scenes, self.device, self.dtype = scenes, device, np.dtype(dtype)
         self.tuning = Tuning.of(device, dtype)
         counts = [len(s.origin) for s in scenes]
-        self._ends = np.cumsum(counts)
-        self.first = device.put(np.concatenate([[0], self._ends]), np.int32)
+        self.host_first = np.concatenate([[0], np.cumsum(counts)])
+        self.first = device.put(self.host_first, np.int32)
         self.host_boxes = Boxes(
             np.repeat(np.arange(len(scenes)), counts),
             np.concatenate([s.origin for s in scenes]),
@@ -94,10 +94,8 @@ class SceneBuffers:
             name,
             dtype=self.dtype,
             local_size=local_size or self.tuning.local_size(n_axes),
-            ROWS=self.tuning.row_loops,
-            WG=self.tuning.sum_group,
-            ALIGN=ALIGN,
-            **defines,
+            **{"ROWS": self.tuning.row_loops, "WG": self.tuning.sum_group, "ALIGN": ALIGN}
+            | defines,
         )
 
     def scene_launcher(self, name, local_size=None):
@@ -128,18 +126,21 @@ class SceneBuffers:
 
     def split(self, rows):
         """Arrays (S, ...) of all sources, split by scene."""
-        return np.split(rows, self._ends[:-1])
+        return np.split(rows, self.host_first[1:-1])
 
     def unpack(self, flat):
-        """A flat device buffer on the host: for each scene, its sources' arrays (ny, nx)."""
-        arrays, starts = self.host_boxes.unpack(self.device.get(flat)), [0, *self._ends]
-        return [arrays[a:b] for a, b in zip(starts, self._ends, strict=False)]
+        """A flat buffer's values: for each scene, its sources' arrays (ny, nx)."""
+        arrays = self.host_boxes.unpack(flat)
+        return [arrays[a:b] for a, b in zip(self.host_first, self.host_first[1:])]
 
-    def states(self) -> list[State]:
-        """The present States of all scenes, back on the host."""
-        return [State(*parts) for parts in zip(*self.downloaded(*self.iterated), strict=True)]
+    def morphologies(self, which):
+        """The morphologies of the scenes `which` (B,), likewise; of others without meaning."""
+        starts = np.append(self.host_boxes.offset, self.host_boxes.size)[self.host_first]
+        parts = np.stack([starts[:-1], starts[1:]], axis=1)[which]
+        return self.unpack(self.device.get_parts(self.morph, parts))
 
     def downloaded(self, morph, spectra, sky):
         """Morphologies, spectra and sky levels of each scene, of device arrays like these."""
-        spectra, sky = (self.device.get(a).astype(float) for a in (spectra, sky))
+        morph, *numbers = self.device.get_all([morph, spectra, sky])
+        spectra, sky = (values.astype(float) for values in numbers)
         return self.unpack(morph), self.split(spectra), sky

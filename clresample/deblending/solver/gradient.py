@@ -17,6 +17,7 @@ import numpy as np
 
 from ...resampling.resampler import Resampler
 from .rendering.stage_selection import select_rendering
+from .rendering.windows import WindowRendering
 
 
 class LossGradient:
@@ -25,13 +26,15 @@ class LossGradient:
     buffers: the batch; d_morph and d_spectra of it are overwritten
     depth: the stage of rendering at which spectra are applied, see rendering/stages.py; None = the
         cheapest for each observation
+    before: LossGradient of a batch that contained these scenes, whose stages are reused; windows
+        are counted again
     rows (C + 1,): first observed row of each channel, then their total; the columns of rows_loss
         and rows_pull
     rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row; the first row
         of a channel includes the prior of its sky. Sums over its rows are its loss and dL/dsky
     """
 
-    def __init__(self, buffers, depth=None):
+    def __init__(self, buffers, depth=None, *, before=None):
         self.buffers, scenes = buffers, buffers.scenes
         heights = [op.shape_out[1] for op in scenes[0].ops for _ in range(op.shape_out[0])]
         self.rows = np.concatenate([[0], np.cumsum(heights)])
@@ -39,7 +42,11 @@ class LossGradient:
         self.rows_loss, self.rows_pull = (
             buffers.device.empty(shape, buffers.dtype) for _ in range(2)
         )
-        self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
+        depths = [depth] * len(scenes[0].ops)
+        if before is not None:
+            had = [o.rendering.depth for o in before.observations]
+            depths = [None if depth == WindowRendering.depth else depth for depth in had]
+        self.observations = [_ObservedBatch(self, i, depth) for i, depth in enumerate(depths)]
         self._tie, self._expect_sky = None, None
         known = np.array([scene.known_sky for scene in scenes])
         if known.any():

@@ -98,7 +98,7 @@ class AMSGrad:
     def memories(self) -> list[AmsgradMoments]:
         """Each scene's moments, back on the host."""
         b = self.buffers
-        morph = zip(*(b.unpack(a) for a in self._m_morph), strict=True)
+        morph = zip(*(b.unpack(b.device.get(a)) for a in self._m_morph), strict=True)
         spectra = zip(*(b.split(b.device.get(a)) for a in self._m_spectra), strict=True)
         return [AmsgradMoments(list(m), np.stack(s)) for m, s in zip(morph, spectra, strict=True)]
 

@@ -27,7 +27,7 @@ class AmsgradBuffers(SceneBuffers):
     def stepped(self, iterated, memories, n_steps) -> list[AmsgradState]:
         """States of all scenes from device arrays like `iterated`, back on the host."""
         latent, *others = iterated
-        parts = *self.downloaded(*others), self.unpack(latent), memories
+        parts = *self.downloaded(*others), self.unpack(self.device.get(latent)), memories
         return [
             AmsgradState(*own, latent=z, memory=memory, n_steps=n_steps)
             for *own, z, memory in zip(*parts, strict=True)

@@ -11,8 +11,6 @@ accurate only to 0.05, a fifth of Settings.loss_tol.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..buffers import SceneBuffers
@@ -47,7 +45,8 @@ class MultiscaleEngine:
     def __init__(self, scenes, states, device, dtype, prior, loss_tol, *, past=None):
         self.scenes, self._states, self.device, self.prior = scenes, states, device, prior
         b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
-        self._gradient = LossGradient(b)
+        before = None if past is None else past[0]._gradient
+        self._gradient = LossGradient(b, before=before)
         self.structure = StructureOperator(b, prior)
         latents = self.structure.latents
         v = self.vectors = SolverVectors(b, latents, N_PAIRS + 1)
@@ -59,8 +58,9 @@ class MultiscaleEngine:
             self.strengths = PriorStrengths(b, self._gradient, latents, prior, states)
             v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
-            weights = self.strengths.weights(np.concatenate([s.spectra for s in states]))
-            self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+            spectra = np.concatenate([s.spectra for s in states])
+            self.strengths.request_blocks(spectra, self.progress.n_rounds)
+            self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
         else:
             engine, keep = past
             self.progress, self.pairs = engine.progress.take(keep), engine.pairs.subset(keep)
@@ -69,7 +69,7 @@ class MultiscaleEngine:
             )
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
-            self.steps.take_blocks(self.strengths.blocks)
+        self.steps.take_blocks(self.strengths.schedule.blocks)
 
     def subset(self, keep):
         """An engine of the scenes `keep` (n,) alone, which continue unchanged."""
@@ -88,7 +88,9 @@ class MultiscaleEngine:
 
         returns accepted (B,): scenes whose progress.loss is new
         """
-        p = self.progress
+        p, blocks = self.progress, self.strengths.take_blocks(self.progress.n_rounds)
+        if blocks is not None:
+            self.steps.take_blocks(blocks)
         sums, slope, loss = self._evaluate()
         accepted, stepped = p.accept_trials(loss, slope)
         new = np.flatnonzero(stepped)
@@ -111,9 +113,8 @@ class MultiscaleEngine:
         gradient.queue()
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
         v.pack_gradients(gradient.rows_pull, self._row0)
-        sums, slope, energy = self.steps.change()
-        rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
-        return sums, slope, rows + 0.5 * energy
+        sums, slope, energy, rows = self.steps.change(gradient.rows_loss)
+        return sums, slope, rows.sum(1, dtype=np.float64) + 0.5 * energy
 
     def _clear(self, asking):
         """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""
@@ -125,15 +126,16 @@ class MultiscaleEngine:
     def _energies(self, vector):
         """|z|^2 (S, J) of a vector, and the spectra (S, C) last taken."""
         self.structure.energy(vector)
-        energies, spectra = self.structure.energies, self.buffers.spectra
-        return tuple(self.device.get(a).astype(np.float64) for a in (energies, spectra))
+        both = self.device.get_all([self.structure.energies, self.buffers.spectra])
+        return tuple(values.astype(np.float64) for values in both)
 
     def _learn(self, due):
         """Updates strengths, and all that depends, of the scenes `due` (B,); inner products."""
         energies, spectra = self._energies(self.vectors.x_new)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
+        self.strengths.request_blocks(spectra, self.progress.n_rounds, due)
         self._rest_others(self.progress.live)
-        self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+        self.steps.reweigh(self.strengths.light, weights)
         self.progress.record_strengths(due, moved, change)
         return self.steps.change()[0]  # its s and y go into spare slots
 
@@ -141,12 +143,18 @@ class MultiscaleEngine:
         """Restricts the launches that follow to the scenes `live` (B,)."""
         self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
-    def states(self) -> list[State]:
-        """The scenes' present states, back on the host."""
+    def states(self, which=None) -> list[State | None]:
+        """The present states of the scenes `which` (B,), None: of all; None for the others."""
+        which = np.ones(len(self.scenes), bool) if which is None else which
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
-        v.unpack_spectra(v.x)
-        return _that_learned(b.states(), v.split(v.x), self.strengths.by_scene())
+        morphs, parts = b.morphologies(which), v.split(v.x, which)
+        known = self.strengths.by_scene()
+        found: list[State | None] = [None] * len(which)
+        for i in np.flatnonzero(which).tolist():
+            structure, spectra, sky = parts[i]
+            found[i] = State(morphs[i], spectra, sky, StructureState(structure, *known[i]))
+        return found
 
     def findings(self, which):
         """StrengthEstimates of the scenes `which` (B,) at their present states, None for others."""
@@ -155,7 +163,7 @@ class MultiscaleEngine:
 
     def slopes(self, which):
         """The SceneGradient of the scenes `which` (B,) at their present states, None for others."""
-        x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
+        x, g = (self.vectors.split(v, which) for v in (self.vectors.x, self.vectors.g))
         return [
             SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
             for now, slopes, on in zip(x, g, which, strict=True)
@@ -193,17 +201,6 @@ def _begins(latents, states):
         arrays += state.learned.structure if state.learned else [None] * len(state.morph)
     spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
     return latents.pack(arrays), spectra, sky
-
-
-def _that_learned(states, parts, known):
-    """States with structure and strengths; parts: see `SolverVectors.split`.
-
-    known: `PriorStrengths.by_scene`.
-    """
-    return [
-        replace(state, learned=StructureState(structure, *own))
-        for state, (structure, *_), own in zip(states, parts, known, strict=True)
-    ]
 
 
 def _n_pixels(scene):

@@ -30,13 +30,15 @@ class LbfgsSteps:
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
         self._levels, self.shelf = [], shelf or FactorStore(b.device, b.dtype)
+        self._sent = []  # events of uploads that may be on their way
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
         shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
-        group = b.tuning.sum_group
+        group = b.tuning.vector_group
 
         def launcher(name, size=(group, 1)):
-            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
+            macros = {"SLOTS": n_slots, "WG": group}
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, **macros)
 
         self._trial = launcher("form_pairs").bind(
             **shared,
@@ -48,7 +50,7 @@ class LbfgsSteps:
             projected=projected,
             hg_new=hg_new,
         )
-        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL}
+        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
         self._invert = b.launcher(
             "block_inverse.cl", "apply_block_inverse", 2, local_size=size, **macros
         ).bind(plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new)
@@ -80,42 +82,45 @@ class LbfgsSteps:
     def follow(self, pairs, mode):
         """Uploads the mode (B,) of each scene, REST, NEXT, ..., and the slots of its pairs."""
         plan = np.stack([mode, pairs.used, pairs.spare], axis=1)
-        self._buffers.device.upload(np.ascontiguousarray(plan, np.int32), self._plan)
+        self._send(np.ascontiguousarray(plan, np.int32), self._plan)
 
-    def change(self):
+    def _send(self, values, array):
+        """Queues an upload that ends before the next sums come back."""
+        self._sent.append(self._buffers.device.upload(values, array, wait=False))
+
+    def change(self, *others):
         """Inner products of trials; s and H y go into the spare slots.
 
         s_k . P g, H y_k . P g, s_k . y, H y_k . y (B, slots, 4), g . s (B,), x_new . precision
-        x_new (B,); for idle scenes the former values.
+        x_new (B,); for idle scenes the former values. Then the values of `others`, device arrays
+        that are read in the same wait.
         """
         self._trial(self._size)
         for size, given in self._levels:
             self._invert(size, **given)
         self._change(self._size)
-        sums = self._by_scene(self._sums)
-        return sums[:, :-2].reshape(len(sums), self._n_slots, 4), sums[:, -2], sums[:, -1]
-
-    def _by_scene(self, sums):
-        values = self._buffers.device.get(sums).astype(np.float64)
-        return np.add.reduceat(values, self._first_chunks, axis=0)
+        sums, *others = self._buffers.device.get_all([self._sums, *others])
+        self._sent.clear()
+        sums = np.add.reduceat(sums.astype(np.float64), self._first_chunks, axis=0)
+        products = sums[:, :-2].reshape(len(sums), self._n_slots, 4)
+        return products, sums[:, -2], sums[:, -1], *others
 
     def advance(self, a, c, scale, length):
         """Queues the next trials: a, c (B, slots), scale, length (B,)."""
         b = self._buffers
         table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
-        b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
+        self._send(np.ascontiguousarray(table, b.dtype), self._coefficients)
         self._advance(self._size)
 
-    def reweigh(self, light, weights, blocks):
-        """Queues h and g_new of other strengths, and takes their blocks.
+    def reweigh(self, light, weights):
+        """Queues h and g_new of other strengths.
 
-        light, weights, blocks: see PriorStrengths. Earlier pairs are kept, because the curvature of
-        chi2 does not change; without them fits take a tenth more rounds.
+        light, weights: see PriorStrengths. Earlier pairs are kept, because the curvature of chi2
+        does not change; without them fits take a tenth more rounds.
         """
         b = self._buffers
         if b.n_free:
             self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
-            self.take_blocks(blocks)
 
     def take_blocks(self, blocks):
         """Sets the CurvatureBlocks of all sources (S)."""

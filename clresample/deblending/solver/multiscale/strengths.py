@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ....device.multi_device import host_threads, map_threads
+from .block_schedule import BlockSchedule
 from .evidence import LocalPowerSpectra, SourceEvidence, blurred_light
 from .inverse import BlockPreconditioner
 from .response import OperatorResponse
@@ -34,7 +36,7 @@ class PriorStrengths:
     values (S, J): alpha; meaningless for fixed sources
     significant (S,): sources whose finest structure is significant, see evidence.py
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
-    blocks (S): of each source, see `BlockPreconditioner.blocks`; none of fixed ones
+    schedule: BlockSchedule of the sources
     """
 
     def __init__(self, buffers, gradient, latents, prior, states=(), *, past=None):
@@ -53,17 +55,16 @@ class PriorStrengths:
                         state.learned.strengths,
                         state.learned.clear,
                     )
-            self._evidence, self._inverses, self._light = self._prepare(prior)
-            self.blocks = [[] for _ in self.values]
+            self._evidence, inverses, self._light = self._prepare(prior)
+            self.schedule = BlockSchedule(inverses, self._scene, b.device)
         else:
             other, keep = past
             kept = np.concatenate([np.flatnonzero(other._scene == i) for i in keep])
             self.values, self._curvature = other.values[kept], other._curvature[kept]
             self.significant = other.significant[kept]
             self._evidence = [other._evidence[i] for i in kept]
-            self._inverses = [other._inverses[i] for i in kept]
             self._light = [other._light[i] for i in kept]
-            self.blocks = [other.blocks[i] for i in kept]
+            self.schedule = other.schedule.subset(kept, self._scene)
         self.precision = b.put(self.values**-2)
         self.light = b.put(latents.pack(self._light))
 
@@ -76,26 +77,42 @@ class PriorStrengths:
         answers, pixels = self._response.impulse_responses()
         pairs = zip(answers, pixels, strict=True)
         responses = [spectra.from_impulse_responses(*pair) for pair in pairs]
-        for s in self._free:
+
+        def prepare(s):
             evidence[s] = SourceEvidence(spectra, prior, profiles[s], responses[self._scene[s]])
             light[s] = [
                 blurred_light(profiles[s], sigma, step)
                 for sigma, step in zip(prior.scales_px, prior.steps, strict=True)
             ]
             inverses[s] = BlockPreconditioner(evidence[s], profiles[s], light[s])
+
+        map_threads(host_threads(self.buffers.device), prepare, self._free)
         return evidence, inverses, light
 
     def weights(self, spectra, due=None, change=0.0):
         """For `LbfgsSteps.reweigh` (S, J, 3): precision, curvature, change.
 
-        spectra (S, C): at which curvature and blocks are recomputed, in the scenes `due` (B,) or in
-        all
+        spectra (S, C): at which the curvature is recomputed, in the scenes `due` (B,) or in all
         """
-        for s in self._free if due is None else self._free[due[self._scene[self._free]]]:
+        for s in self._free if due is None else self._free_of(due):
             self._curvature[s] = self._evidence[s].curvature(spectra[s])
-            self.blocks[s] = self._inverses[s].blocks(self.values[s], spectra[s])
         precision = self.values**-2
         return np.stack([precision, self._curvature, precision * 0 + change], axis=2)
+
+    def request_blocks(self, spectra, rounds, due=None):
+        """Has blocks made for the present strengths and spectra (S, C), see BlockSchedule.
+
+        rounds (B,): of the scenes; due (B,): the scenes whose blocks are made, None: all, which
+            then count from now on
+        """
+        sources = self._free if due is None else self._free_of(due)
+        self.schedule.request(sources, self.values, spectra, rounds)
+        if due is None:
+            self.schedule.take(rounds, sources)
+
+    def take_blocks(self, rounds):
+        """Takes blocks whose time has come; returns those of all sources (S) if any did."""
+        return self.schedule.blocks if self.schedule.take(rounds) else None
 
     def find_significant(self, due, energies, spectra):
         """Finds significant sources of the scenes `due` (B,); returns scenes (B,) with new ones."""
@@ -113,7 +130,7 @@ class PriorStrengths:
         returns moved (B,): largest change of a ln alpha; the weights; change (B,) of the losses
         """
         chi2, old = self._response.misfit(spectra), self.values.copy()
-        for s in self._free[due[self._scene[self._free]]]:
+        for s in self._free_of(due):
             given = old[s], energies[s], spectra[s], chi2[s]
             self.values[s] = self._evidence[s].learned(*given, clear=self.significant[s])
         change = self.values**-2 - old**-2
@@ -128,7 +145,7 @@ class PriorStrengths:
     def findings(self, which, energies, spectra):
         """StrengthEstimates of the scenes `which` (B,), None for others; energies (S, J): |z|^2."""
         determined = np.zeros_like(self.values)
-        for s in self._free[which[self._scene[self._free]]]:
+        for s in self._free_of(which):
             determined[s] = self._evidence[s].determined(self.values[s], spectra[s])
         parts = [self._scene == i if on else None for i, on in enumerate(which)]
         return [
@@ -146,6 +163,10 @@ class PriorStrengths:
     def significant_scenes(self):
         """Selects scenes (B,) with sources whose finest structure is significant."""
         return self._by_scene(self.significant) > 0
+
+    def _free_of(self, which):
+        """The free sources (n,) of the scenes `which` (B,)."""
+        return self._free[which[self._scene[self._free]]]
 
     def _by_scene(self, values):
         """Sums (B,) over the scenes' sources."""

@@ -55,11 +55,15 @@ class LatentLayout:
                 out[self.start[s] : self.start[s] + len(flat)] = flat
         return out
 
-    def unpack(self, vector):
-        """Arrays [s][j] (ny_j, nx_j) of a vector (size or more,)."""
+    def unpack(self, vector, sources=slice(None)):
+        """Arrays [s][j] (ny_j, nx_j), float64, of some sources in a vector (size or more,)."""
+        places = zip(self.planes()[sources], self.shape[sources], strict=True)
         return [
-            [vector[a : a + n].reshape(shape) for (a, n), shape in zip(planes, shapes, strict=True)]
-            for planes, shapes in zip(self.planes(), self.shape, strict=True)
+            [
+                vector[a : a + n].reshape(shape).astype(np.float64)
+                for (a, n), shape in zip(planes, shapes, strict=True)
+            ]
+            for planes, shapes in places
         ]
 
 
@@ -87,6 +91,7 @@ class StructureOperator:
             "STEPS": _list(prior.steps),
             "TAPS": n_taps,
             "MARGIN": margin,
+            "WG": b.tuning.vector_group,
         }
         rows = self.latents.shape[:, :, 0].sum(1)
         lines = np.maximum(rows, b.host_boxes.shape[:, 0])  # of condense, and of spread
@@ -100,7 +105,7 @@ class StructureOperator:
         placed = shared | {"start": b.device.put(start, np.int32)}
         sided = placed | {"taps": b.put(taps), "line": line}
         gauged = shared | {"inverse": b.put(inverse), "profile": b.profile, "morph": b.morph}
-        group = b.tuning.sum_group
+        group = b.tuning.vector_group
         launcher = b.launcher
         u = b.zeros_flat()
         self.energies = b.put(np.zeros((b.n_sources, self.n_scales)))

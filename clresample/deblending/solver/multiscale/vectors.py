@@ -61,49 +61,41 @@ class SolverVectors:
     def parts(self):
         """First and one-past-last elements (B, 3, 2) of each scene's z, spectra and sky."""
         b, c = self.buffers, self.buffers.n_channels
-        source = b.device.get(b.first).astype(np.int64)
+        source = b.host_first
         starts = np.append(self.latents.start, self.latents.size)
         sky = self.latents.size + self.n_spectra
         ends = starts[source], self.latents.size + source * c, sky + np.arange(len(source)) * c
         return np.stack([np.stack([e[:-1], e[1:]], axis=1) for e in ends], axis=1)
 
-    def split(self, vector):
-        """Splits a host vector by scenes: coefficients [s][j], spectra (n, C) and sky (C,).
+    def split(self, vector, which):
+        """Of a vector the parts of the scenes `which` (B,), None for the others.
 
-        Coefficients have the shape (ny_j, nx_j).
+        Coefficients [s][j] (ny_j, nx_j), spectra (n, C) and sky (C,), float64
         """
-        values = self.buffers.device.get(vector).astype(np.float64)
-        structure = self.latents.unpack(values)
-        spectra, sky = self._numbers(values)
-        source = self.buffers.device.get(self.buffers.first)
-        return [
-            (structure[a:b], spectra[a:b], sky[i])
-            for i, (a, b) in enumerate(zip(source[:-1], source[1:], strict=True))
-        ]
+        parts, source, found = self.parts(), self.buffers.host_first, [None] * len(which)
+        values = self.buffers.device.get_parts(vector, parts[which].swapaxes(0, 1))
+        for i in np.flatnonzero(which):
+            spectra, sky = (values[a:b].astype(np.float64) for a, b in parts[i, 1:])
+            structure = self.latents.unpack(values, slice(*source[i : i + 2]))
+            found[i] = structure, spectra.reshape(-1, self.buffers.n_channels), sky
+        return found
 
     def put_directions(self, steps):
         """Overwrites the directions d of some scenes.
 
         steps {scene: parts as of `split`}, structure None where a source has none.
         """
-        values = self.buffers.device.get(self.d)
-        spectra, sky = self._numbers(values)
-        source = self.buffers.device.get(self.buffers.first)
-        for low, high in self.parts()[list(steps), 0]:
-            values[low:high] = 0
-        for i, (structure, by_spectrum, by_sky) in steps.items():
-            spectra[source[i] : source[i + 1]], sky[i] = by_spectrum, by_sky
+        pieces, source = {}, self.buffers.host_first
+        for i, parts in zip(steps, self.parts()[list(steps)], strict=True):
+            structure, by_spectrum, by_sky = steps[i]
+            (low, high), (at_spectra, _), (at_sky, _) = parts.tolist()
+            values = np.zeros(high - low)
             for start, scales in zip(self.latents.start[source[i] :], structure):
                 if scales is not None:
                     flat = np.concatenate([np.ravel(part) for part in scales])
-                    values[start : start + len(flat)] = flat
-        self.buffers.device.upload(values, self.d)
-
-    def _numbers(self, values):
-        """Spectra (S, C) and sky levels (B, C) in the elements of a vector, on the host."""
-        n, c = self.latents.size, self.buffers.n_channels
-        both = values[n:].reshape(-1, c)
-        return both[: self.n_spectra // c], both[self.n_spectra // c :]
+                    values[start - low : start - low + len(flat)] = flat
+            pieces |= {low: values, at_spectra: np.ravel(by_spectrum), at_sky: np.ravel(by_sky)}
+        self.buffers.device.put_parts(pieces, self.d)
 
     def _chunks(self):
         length, rows = self.buffers.tuning.vector_chunk, []
