@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...sky.extent import intersect_boxes
+from ...sky.box import intersect_boxes
 from ..profiles import GalaxyProfile
 from ..start.population import contamination_factors
 from .profile_modes import SHAPE_MODES
@@ -62,8 +62,8 @@ def shape_doubts(posterior, owner, n_sources) -> np.ndarray:
     for i in doubted:
         known = posterior.covariance.block(i, i)[at[i][:, None], at[i]]
         moved = out[..., column[i]] @ _added_root(known, factors[i])
-        own = np.linalg.norm(solution.spectra[i] * slopes[i][0, layout.n_modes[i]])
-        most = MAX_DOUBT * own / max(np.linalg.norm(moved[owner[i]]), 1e-30)
+        own = float(np.linalg.norm(solution.spectra[i] * slopes[i][0, layout.n_modes[i]]))
+        most = MAX_DOUBT * own / max(float(np.linalg.norm(moved[owner[i]])), 1e-30)
         out[..., column[i]] = min(1.0, most) * moved
     return out
 
