@@ -23,6 +23,7 @@
  * first half of its columns, of X W^T with one work-item for all columns. A work-item takes RT
  * tiles of MR rows, of MR / 2 on the way back.
  */
+#define ON_CPU 1
 #include "prefetch.h"
 #include "contract.h"
 

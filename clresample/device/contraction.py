@@ -26,6 +26,8 @@ SUM_BLOCK = 64
 ROW_TILES = 8
 # Terms that a turn of its loop adds, KU of contract.h: stretches are a multiple of them.
 TERMS = 4
+# Stages after a product, as the kernels for CPUs number them.
+EPILOGUES = (None, "MIX", "TWIST")
 # Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
 ONE_SUM = 256
 
@@ -150,8 +152,8 @@ class Contraction:
     ):
         self.device, self.dtype = device, dtype
         self.tuning = tuning or Tuning.of(device, dtype)
-        self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
-        self.options |= {epilogue: True} if epilogue else {}
+        self.options = {"RAGGED": ragged, "STRIDED": strided}
+        self.epilogue, self.sign = epilogue, -1 if adjoint else 1
 
     def build(self, n_rows=None, n_terms=0, n=0):
         """(file, macros) for numbers of rows, terms and columns; by default the largest."""
@@ -160,7 +162,8 @@ class Contraction:
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
             return FILE, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
-        return GROUP_FILE, self.options | tile | {"TWO_SUMS": two_sums}
+        stage = {"SIGN": self.sign} | ({self.epilogue: True} if self.epilogue else {})
+        return GROUP_FILE, self.options | stage | tile | {"TWO_SUMS": two_sums}
 
     def bind(
         self,
@@ -188,7 +191,9 @@ class Contraction:
         whole_a = a.step == 1 and a.stride == m * a.ld and a.items_per_matrix == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, n)
-        tile = tile | {"OWN": own is not None}
+        stage = {"epilogue": EPILOGUES.index(self.epilogue), "sign": self.sign}
+        if "KB" in tile:
+            tile, stage = tile | {"OWN": own is not None}, {}
         which = own and own.table_index
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
@@ -223,6 +228,7 @@ class Contraction:
             n_bands=n_bands,
             which=which,
             own=sizes,
+            **stage,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
         return BoundContraction(launch, tile, m, self._extent(tile, n), starts if tall else None)

@@ -165,15 +165,10 @@ class Tuning:
     def tile_for_columns(self, n, n_pad) -> dict[str, int]:
         """The tile for rows of `n` columns, of `n_pad` in whole vectors, on CPUs.
 
-        Where two vectors at a time would leave one alone, which uses half of the registers: five at
-        a time, if that leaves none. Where the last of few float32 vectors is half empty or more:
-        two half as wide, of which that one is not summed. With more columns it gains less than the
-        2 % that the two take longer.
+        Where the last of few float32 vectors is half empty or more: two half as wide, of which that
+        one is not summed. With more columns it gains less than the 2 % that the two take longer.
         """
         tile = self.tile
-        two = tile["NV"] == 2 and tile["MR"] == 8
-        if two and n_pad % (5 * tile["VW"]) == 0 and n_pad // tile["VW"] % 2:
-            return tile | {"NV": 5, "MR": 4}
         if tile["VW"] == 16 and tile["NV"] == 1 and n <= 128 and 1 <= n % 16 <= 8:
             return tile | {"VW": 8, "NV": 2}
         return tile

@@ -37,12 +37,14 @@ class BoxedProduct:
             dtype=b.dtype,
             local_size=(*group, 1),
             STRIDED=strided,
-            RAGGED=ragged,
+            RAGGED=ragged and not b.tuning.row_loops,
+            ON_CPU=b.tuning.row_loops,
             **tile,
         ).bind(
             items=b.device.put(np.stack(items, axis=1), np.int64),
             block=terms_per_block(int(max(items[2]))),
             inward=inward,
+            ragged=ragged,
         )
 
     def __call__(self, a, b, c, active, *, add=False):
