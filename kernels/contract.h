@@ -165,9 +165,9 @@
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
         UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
-        SUM_TERMS(MR, 1, 2, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, 1, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else if (MR > 2 && (below) <= 2) { \
-        SUM_TERMS(2, NV, 2, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(2, NV, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else { \
         SUM_TERMS(MR, NV, KU, sums, row, B, ld_b, column, k, block, inward) \
     }

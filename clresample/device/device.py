@@ -153,7 +153,9 @@ class Device:
 
     def launch(self, kernel, global_size, local_size=None):
         """Queues a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
-        return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
+        event = self._call(self._enqueue, self.queue, kernel, global_size, local_size)
+        self._programs.notice.wait_for_first_launch(kernel, self.finish)
+        return event
 
     def finish(self, queue=None):
         """Waits until all queued work is done, here or in another in-order queue."""
