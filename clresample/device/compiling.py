@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from ..drawing.bar import is_watched, passing_bar
 
 # [s] Processor time of a build: from PoCL's or pyopencl's cache 0.02, from source 0.08 and more.
 MAX_CACHED_S = 0.04
+PLATFORM = "Portable Computing Language"
 
 
 class CompilationNotice:
@@ -71,3 +74,24 @@ class CompilationNotice:
                 print(f"compiling kernels for {self.device}, once", file=sys.stderr, flush=True)
             if self._bar is not None:
                 self._bar.update()
+
+
+def compile_beside(device):
+    """Starts a process that compiles products while this one tests a device at its first use.
+
+    PoCL compiles one program at a time in a process, but processes share its cache. The self-test
+    compiles four products; those of turned operators and of sources' boxes are in the cache soon
+    after. The process ends by itself, prints nothing, and does no harm if it fails.
+
+    device: a Device; nothing is done for other platforms than PoCL, or without a second core
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    if device.platform != PLATFORM or device.kind != "CPU" or n_cores < 2 or not sys.executable:
+        return
+    module = f"{__package__}.prebuild"
+    command = [sys.executable, "-m", module, f"{device.platform}:{device.name}"]
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    with suppress(OSError):
+        process = subprocess.Popen(command, **quiet)
+        threading.Thread(target=process.wait, daemon=True).start()

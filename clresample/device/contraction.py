@@ -281,6 +281,22 @@ class BoundContraction:
         self.launch((self.n_x, n_y, batch), **given)
 
 
+def box_product(device, dtype, *, strided, ragged, tuning=None):
+    """Launcher of kernels/boxed.cl; see `BoxedProduct` of the solver for its layouts."""
+    tuning = tuning or Tuning.of(device, dtype)
+    tile, on_cpu = tuning.tile_for_boxes, tuning.row_loops
+    return device.launcher(
+        "boxed.cl",
+        "multiply_boxes",
+        dtype=dtype,
+        local_size=(tile["WGX"], tile["WGY"], 1),
+        STRIDED=strided,
+        RAGGED=ragged and not on_cpu,  # there an argument
+        ON_CPU=on_cpu,
+        **tile,
+    )
+
+
 def _groups(n, group):
     """`n` work-items rounded up to whole groups."""
     return -(-n // group) * group

@@ -21,6 +21,7 @@ import weakref
 import numpy as np
 
 from . import selftest
+from .compiling import compile_beside
 from .device_cache import DeviceCache, DeviceWarning
 from .discovery import (
     DeviceError,
@@ -279,6 +280,8 @@ def _fault(cl_device):
     """Why a pyopencl device is not to be used, or None."""
     try:
         device = _open(cl_device)
+        if not selftest.has_passed(device.remembered):
+            compile_beside(device)
         return selftest.self_test_fault(device, device.remembered)
     except (DeviceError, load_pyopencl().Error) as error:
         return f"{cl_device.name.strip()} fails its self-test: {error}"

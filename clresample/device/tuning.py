@@ -162,6 +162,11 @@ class Tuning:
             return self.tile | {"MR": middle if middle in choices else max(choices)}
         return self.tile | {"MR": min(choices, key=covered)}
 
+    @property
+    def tile_for_boxes(self) -> dict[str, int]:
+        """The tile of boxed.cl."""
+        return self.box_tile or self.tile
+
     def tile_for_columns(self, n, n_pad) -> dict[str, int]:
         """The tile for rows of `n` columns, of `n_pad` in whole vectors, on CPUs.
 
