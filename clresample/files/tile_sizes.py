@@ -17,7 +17,7 @@ def check_tiles(path, hdu):
     """Raises FileError where an HCOMPRESS tile has another size than its header says.
 
     astropy (to 8.0 at least) makes room by the header and writes by the tile, over whatever lies
-    behind it in memory.
+    behind it in memory: tools/astropy_hcompress.md is a report of it for astropy.
     """
     if not isinstance(hdu, fits.CompImageHDU) or hdu.compression_type != "HCOMPRESS_1":
         return
