@@ -1,4 +1,4 @@
-"""The benchmark beside other deblenders: its table, and its answer where BlendingToolKit is missing."""
+"""The benchmark beside other deblenders: its table, and its answer without BlendingToolKit."""
 
 import importlib.util
 import json

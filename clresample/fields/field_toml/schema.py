@@ -6,7 +6,10 @@ from .keys import FIELD_TABLES, REQUIRED, SCENE_TABLES, SURVEY
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 # Kinds of files: their tables, and the name of their images.
-KINDS = {"scene": (SCENE_TABLES, "observation"), "field": (FIELD_TABLES, "mosaic")}
+KINDS: dict[str, tuple[dict, str]] = {
+    "scene": (SCENE_TABLES, "observation"),
+    "field": (FIELD_TABLES, "mosaic"),
+}
 
 
 def json_schema(kind) -> dict:
