@@ -29,9 +29,9 @@
 #ifndef RAGGED      /* 1: C is a caller's array, stored element by element; 0: padded, by vectors */
 #define RAGGED 0
 #endif
-/* ON_CPU: a tile's sums are copied to memory once they are complete, and what follows is a loop over
- * them; epilogues and OWN are arguments. So few and small builds serve all products: unrolled, and a
- * build for each of them, the first fit of a machine compiled for 18 core-seconds, now for 9. */
+/* ON_CPU: a tile's sums are copied to memory once they are complete, and a loop over them follows;
+ * epilogues and OWN are arguments. So few and small builds serve all products: with everything
+ * unrolled, and a build for each product, a first fit compiled for 18 core-seconds, now for 8. */
 #ifndef ON_CPU
 #define ON_CPU 0
 #endif
