@@ -19,6 +19,9 @@
  * each rounded up to its local size.  On CPUs one work-item computes all columns, because a tile of
  * a small box takes no longer than the start of a work-item.
  */
+#if ON_CPU          /* one build for both, see contract.h */
+#define RAGGED ragged
+#endif
 #include "contract.h"
 
 enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, LD_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_COLUMNS };
@@ -26,7 +29,8 @@ enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, LD_B, SKIP, BEGIN_C, LD_C, NEXT_
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void multiply_boxes(__global const int *restrict active, __global const long *restrict items,
            const int block, const int inward, __global const REAL *restrict A,
-           __global const REAL *restrict B, __global REAL *restrict C, const int add)
+           __global const REAL *restrict B, __global REAL *restrict C, const int ragged,
+           const int add)
 {
     __global const long *item = items + (size_t)N_COLUMNS * active[get_global_id(2)];
     const int m = (int)item[M], k = (int)item[K], skip = (int)item[SKIP];
@@ -48,20 +52,21 @@ void multiply_boxes(__global const int *restrict active, __global const long *re
         WIDE acc[MR][NV];
         UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
         SUM_INSIDE(n_pad - j0, MR, acc, row, B, ld_b, column, k, block, inward)
-        UNROLL(i, MR) UNROLL(v, NV) {
+        HOLD_SUMS
+        EACH(i, MR) EACH(v, NV) {
             if (i0 + i >= m || j0 + v * VW >= n_pad) continue;
-#if RAGGED
             __global REAL *c = C + (size_t)(i0 + i) * (size_t)item[LD_C];
-            const REAL *lane = (const REAL *)&acc[i][v];
+            if (!RAGGED) {
+                AT(WIDE, c + column[v]) = SUMS[i][v];
+                continue;
+            }
+            const REAL *lane = (const REAL *)&SUMS[i][v];
             for (int j = 0; j < VW; ++j) {
                 const int x = j0 + v * VW + j;
                 if (x < skip || x >= end) continue;
                 __global REAL *to = c + (size_t)(x - skip) * (size_t)item[NEXT_C];
                 *to = add ? *to + lane[j] : lane[j];
             }
-#else
-            AT(WIDE, C + (size_t)(i0 + i) * (size_t)item[LD_C] + column[v]) = acc[i][v];
-#endif
         }
     }
 }

@@ -55,6 +55,7 @@
  * Launch: global = (ceil(width / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
  */
+#define ON_CPU 1
 #include "prefetch.h"
 #if READ_AHEAD
 #define PREFETCH_B(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
@@ -90,7 +91,7 @@ void contract(int m, int n, const int n_pad, int k, const int block,
               __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
               const int stride_c,
               __global const REAL *restrict E, const int stride_e, const int band_e,
-              const int n_bands,
+              const int n_bands, const int epilogue, const int sign,
               __global const int *restrict which, __global const int *restrict own)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;
@@ -116,16 +117,15 @@ void contract(int m, int n, const int n_pad, int k, const int block,
 #if READ_AHEAD
         const long skipped = (i0 - top) / MR % KU * (long)n_pad;
         if (!RAGGED || step_c == 1)
-            UNROLL(i, MR) for (int j = j0; j < j0 + NV * VW; j += LINE)
+            ROLL(i, MR) for (int j = j0; j < j0 + NV * VW; j += LINE)
                 PREFETCH(C + (size_t)(i0 + i) * ld_c + j, 1, 3)
-#if MIX || TWIST
-        UNROLL(h, MR / 2) UNROLL(q, PLANES) for (int j = j0; j < j0 + NV * VW; j += LINE)
-            PREFETCH(PLANE(h, q, j), 0, 3)
-#endif
+        if (MIX || TWIST)
+            ROLL(h, MR / 2) ROLL(q, PLANES) for (int j = j0; j < j0 + NV * VW; j += LINE)
+                PREFETCH(PLANE(h, q, j), 0, 3)
 #endif
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
         SUM_INSIDE(n - j0, m - i0, acc, row, B, n_pad, column, terms, block, inward)
-
+        HOLD_SUMS
 #include "contract_epilogue.h"
     }
 }

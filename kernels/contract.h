@@ -30,6 +30,25 @@
 #ifndef RAGGED      /* 1: C is a caller's array, stored element by element; 0: padded, by vectors */
 #define RAGGED 0
 #endif
+/* ON_CPU: a tile's sums are copied to memory once they are complete, and a loop over them follows;
+ * epilogues and OWN are arguments. So few and small builds serve all products: with everything
+ * unrolled, and a build for each product, a first fit compiled for 18 core-seconds, now for 8. */
+#ifndef ON_CPU      /* 1: as said above; 0: for GPUs, whose sums stay in registers */
+#define ON_CPU 0
+#endif
+#if ON_CPU
+#define MIX (epilogue == 1)
+#define TWIST (epilogue == 2)
+#define SIGN sign
+#define OWN (own != 0)
+#define SUMS held
+#define EACH ROLL
+#define HOLD_SUMS WIDE held[MR][NV]; UNROLL(i, MR) UNROLL(v, NV) held[i][v] = acc[i][v];
+#else
+#define SUMS acc
+#define EACH UNROLL
+#define HOLD_SUMS
+#endif
 #ifndef MIX         /* 1: multiply by the transfer function */
 #define MIX 0
 #endif
@@ -38,6 +57,9 @@
 #endif
 #ifndef SIGN        /* of MIX's or TWIST's angles: 1 forward, -1 adjoint */
 #define SIGN 1
+#endif
+#ifndef OWN         /* 1: items have sizes and tables of their own, see contract.cl */
+#define OWN 0
 #endif
 
 #ifndef KU          /* terms of one iteration: with 1, loop overhead takes 6 % of the time */
@@ -50,31 +72,19 @@
 #define AHEAD_LEFT(row, l, step, n)
 #endif
 
-#ifndef OWN         /* 1: items have sizes and tables of their own, see contract.cl */
-#define OWN 0
-#endif
-
 /* Sizes of item b, and the table of a factor. */
-#if OWN
 #define TAKE_OWN \
-    const int table = which[b / n_bands]; \
-    m = own[3 * table]; \
-    n = own[3 * table + 1]; \
-    k = own[3 * table + 2];
-#define TABLE(div) (size_t)((div) ? b / (div) : table)
-#else
-#define TAKE_OWN const int table = b / n_bands;
-#define TABLE(div) (size_t)(b / (div))
-#endif
+    const int table = OWN ? which[b / n_bands] : b / n_bands; \
+    if (OWN) { \
+        m = own[3 * table]; \
+        n = own[3 * table + 1]; \
+        k = own[3 * table + 2]; \
+    }
+#define TABLE(div) (size_t)(OWN && (div) == 0 ? table : b / (div))
 
 /* Address of plane q of the epilogue's tables for an item's row pair h and column j. */
-#if MIX
-#define PLANES 4
-#define BAND_E (size_t)(b % n_bands) * band_e
-#elif TWIST
-#define PLANES 2
-#define BAND_E 0
-#endif
+#define PLANES (MIX ? 4 : 2)
+#define BAND_E (MIX ? (size_t)(b % n_bands) * band_e : 0)
 #define PLANE(h, q, j) \
     (E + (size_t)table * stride_e + BAND_E + (size_t)(i0 / 2 + (h)) * 2 * n_pad \
      + (q) * (2 * n_pad / PLANES) + (j) * 2 / PLANES)
@@ -157,9 +167,9 @@
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
         UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
-        SUM_TERMS(MR, 1, 2, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, 1, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else if (MR > 2 && (below) <= 2) { \
-        SUM_TERMS(2, NV, 2, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(2, NV, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else { \
         SUM_TERMS(MR, NV, KU, sums, row, B, ld_b, column, k, block, inward) \
     }

@@ -23,6 +23,7 @@
  * first half of its columns, of X W^T with one work-item for all columns. A work-item takes RT
  * tiles of MR rows, of MR / 2 on the way back.
  */
+#define ON_CPU 1
 #include "prefetch.h"
 #include "contract.h"
 
@@ -51,7 +52,7 @@
 /* add(rows, vectors, terms a turn) of a tile, or of what it has inside: one vector, or half of its
  * rows, two terms a turn, as in contract.h. */
 #define INSIDE(n_rows, add) { \
-        if (NV > 1 && n_sums - j0 <= VW) add(MR, 1, 2) \
-        else if (MR > 2 && (n_rows) <= MR / 2) add(MR / 2, NV, 2) \
+        if (NV > 1 && n_sums - j0 <= VW) add(MR, 1, 1) \
+        else if (MR > 2 && (n_rows) <= MR / 2) add(MR / 2, NV, 1) \
         else add(MR, NV, KU) \
     }

@@ -50,7 +50,7 @@ void mirror_to_pixels(int m, int n, const int n_pad, int k,
                 __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
                 const int stride_c,
                 __global const REAL *restrict E, const int stride_e, const int band_e,
-                const int n_bands,
+                const int n_bands, const int epilogue, const int sign,
                 __global const int *restrict which, __global const int *restrict own)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;
@@ -77,12 +77,12 @@ void mirror_to_pixels(int m, int n, const int n_pad, int k,
         CLEAR(acc, MR, NV)
 #if READ_AHEAD && SIDE == 0
         const long skipped = (i0 - top) / PAIRS % KU * 2 * (long)n_pad;
-        UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
-        UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(m - 1 - i0 - i) * ld_c + j0)
+        ROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
+        ROLL(i, PAIRS) TO_WRITE(C + (size_t)(m - 1 - i0 - i) * ld_c + j0)
 #elif READ_AHEAD
         if (step_c == 1) {
-            UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
-            UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + n - j0 - NV * VW)
+            ROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
+            ROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + n - j0 - NV * VW)
         }
         if (j0 == 0)
             for (int q = 0; q < PAIRS * ld_a; q += LINE)
@@ -92,10 +92,11 @@ void mirror_to_pixels(int m, int n, const int n_pad, int k,
             const int first = last < FOLDED ? 0 : last + 1 - FOLDED;
             INSIDE(2 * (m_sums - i0), ADD_PAIRS)
         }
-        UNROLL(i, PAIRS) UNROLL(v, NV) {
+        HOLD_SUMS
+        ROLL(i, PAIRS) ROLL(v, NV) {
             if (i0 + i >= m_sums || j0 + v * VW >= width) continue;
-            const WIDE here = acc[2 * i][v] + acc[2 * i + 1][v];
-            const WIDE there = acc[2 * i][v] - acc[2 * i + 1][v];
+            const WIDE here = held[2 * i][v] + held[2 * i + 1][v];
+            const WIDE there = held[2 * i][v] - held[2 * i + 1][v];
 #if SIDE == 0
             AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = here;
             AT(WIDE, C + (size_t)(m - 1 - i0 - i) * ld_c + column[v]) = there;

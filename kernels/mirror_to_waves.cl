@@ -52,7 +52,7 @@ void mirror_to_waves(int m, int n, const int n_pad, int k,
            __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
            const int stride_c,
            __global const REAL *restrict E, const int stride_e, const int band_e,
-           const int n_bands,
+           const int n_bands, const int epilogue, const int sign,
            __global const int *restrict which, __global const int *restrict own)
 {
     int j0 = (int)get_global_id(0) * NV * VW, column[NV];
@@ -91,9 +91,9 @@ void mirror_to_waves(int m, int n, const int n_pad, int k,
         /* two tiles at a time: the rows of both that are cosines, then those that are sines */
         for (int i_two = top; i_two < bottom; i_two += 2 * MR) {
             WIDE sums[2][MR][NV];
-            if (NV > 1) UNROLL(odd, 2) CLEAR(sums[odd], MR, NV)     /* a vector may be left out */
-            UNROLL(i, 2 * MR) TO_WRITE(C + (size_t)(i_two + i) * ld_c + j0)
-            UNROLL(odd, 2) {
+            if (NV > 1) ROLL(odd, 2) CLEAR(sums[odd], MR, NV)     /* a vector may be left out */
+            ROLL(i, 2 * MR) TO_WRITE(C + (size_t)(i_two + i) * ld_c + j0)
+            ROLL(odd, 2) {
                 __global const REAL *row[MR];
                 UNROLL(i, MR) {
                     const int at = i_two + 2 * i + odd;
@@ -102,20 +102,20 @@ void mirror_to_waves(int m, int n, const int n_pad, int k,
                 INSIDE((m - i_two) / 2, ADD_PAIRS)
             }
             for (int i0 = i_two; i0 < i_two + 2 * MR && i0 < bottom; i0 += MR) {
-                WIDE acc[MR][NV];
-                UNROLL(i, MR) UNROLL(v, NV) {
+                WIDE held[MR][NV];
+                ROLL(i, MR) ROLL(v, NV) {
                     const int at = i0 + i < m ? i0 + i : m - 1;
-                    acc[i][v] = sums[i % 2][(i0 - i_two + i) / 2][v];
-                    if (first > 0) acc[i][v] += AT(const WIDE, C + (size_t)at * ld_c + column[v]);
+                    held[i][v] = sums[i % 2][(i0 - i_two + i) / 2][v];
+                    if (first > 0) held[i][v] += AT(const WIDE, C + (size_t)at * ld_c + column[v]);
                     if (is_last && k % 2)
-                        acc[i][v] += A[(size_t)at * ld_a + n_pairs]
+                        held[i][v] += A[(size_t)at * ld_a + n_pairs]
                                      * AT(const WIDE, B + (long)n_pairs * n_pad + column[v]);
                 }
                 if (is_last) {
 #include "contract_epilogue.h"
                 } else {
-                    UNROLL(i, MR) UNROLL(v, NV) if (OWNED(i, v))
-                        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = acc[i][v];
+                    ROLL(i, MR) ROLL(v, NV) if (OWNED(i, v))
+                        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = held[i][v];
                 }
             }
         }
@@ -139,14 +139,15 @@ void mirror_to_waves(int m, int n, const int n_pad, int k,
                 WIDE acc[MR][NV];
                 CLEAR(acc, MR, NV)
                 INSIDE(m - i0, ADD_PAIRS)
-                UNROLL(i, MR) UNROLL(v, NV) {
+                HOLD_SUMS
+                ROLL(i, MR) ROLL(v, NV) {
                     if (!OWNED(i, v)) continue;
                     __global REAL *c = C + (size_t)(i0 + i) * ld_c + column[v];
-                    if (first > 0) acc[i][v] += AT(const WIDE, c);
+                    if (first > 0) held[i][v] += AT(const WIDE, c);
                     if (is_last && k % 2)
-                        acc[i][v] += A[(size_t)(i0 + i) * ld_a + n_pairs * STEP_A]
+                        held[i][v] += A[(size_t)(i0 + i) * ld_a + n_pairs * STEP_A]
                                      * AT(const WIDE, B + (long)n_pairs * n_pad + column[v]);
-                    AT(WIDE, c) = acc[i][v];
+                    AT(WIDE, c) = held[i][v];
                 }
             }
         }

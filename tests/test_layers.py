@@ -13,7 +13,7 @@ import pytest
 from helpers.checkout import ROOT
 
 ALLOWED_IMPORTS = {
-    "device": (),
+    "device": ("drawing",),
     "drawing": (),
     "sky": ("drawing",),
     "resampling": ("device", "drawing", "sky"),

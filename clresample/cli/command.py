@@ -28,6 +28,7 @@ from .field import add_field
 from .fields.report import add_report
 from .options import print_note, printable
 from .resample import add_resample
+from .schema import add_schema
 from .simulate import add_simulate
 
 # Largest length of an error's line: some errors quote a whole file.
@@ -123,6 +124,7 @@ def _ended_as_interrupted():
 
 COMMANDS = (
     add_resample,
+    add_schema,
     add_deblend,
     add_field,
     add_report,

@@ -2,33 +2,96 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager, suppress
+
+from ..drawing.bar import is_watched, passing_bar
 
 # [s] Processor time of a build: 0.02 from PoCL's or pyopencl's cache, 0.08 and more from source.
 MAX_CACHED_S = 0.04
+PLATFORM = "Portable Computing Language"
 
 
 class CompilationNotice:
-    """Prints one line at the first build that no cache had, in terminals and notebooks.
+    """Prints one line at the first build that no cache had, and a count of the later ones.
+
+    Only in terminals and notebooks. The count is erased when nothing is being compiled.
 
     device: name of the device
     """
 
     def __init__(self, device):
-        self.device, self._lock, self._is_said = device, threading.Lock(), False
+        self.device, self._lock = device, threading.Lock()
+        self._launched: set[int] = set()
+        self._n_built = self._n_waiting = 0
+        self._began, self._bar = time.monotonic(), None
 
     def build(self, build):
-        """Returns `build()`, and reports if it took longer than a cached build."""
-        began = time.thread_time()
-        built = build()
-        if time.thread_time() - began > MAX_CACHED_S:
-            self._say()
+        """Returns `build()`, and counts it if it took longer than a cached build."""
+        with self._shown():
+            began = time.thread_time()
+            built = build()
+            if time.thread_time() - began > MAX_CACHED_S:
+                self._count()
         return built
 
-    def _say(self):
+    def wait_for_first_launch(self, kernel, finish):
+        """Calls `finish()` after the first launch of a kernel: drivers for CPUs compile it there.
+
+        Only where the wait is shown.
+        """
+        if not self._n_built or not is_watched() or kernel.int_ptr in self._launched:
+            return
+        self._launched.add(kernel.int_ptr)
+        with self._shown():
+            finish()
+
+    @contextmanager
+    def _shown(self):
+        """Draws the count meanwhile; threads that compile at the same time share it."""
         with self._lock:
-            is_first, self._is_said = not self._is_said, True
-        if is_first and (sys.stderr.isatty() or "ipykernel" in sys.modules):
-            print(f"compiling kernels for {self.device}, once", file=sys.stderr, flush=True)
+            self._n_waiting += 1
+            if self._n_built and self._bar is None and is_watched():
+                title = f"compiling kernels for {self.device}"
+                self._bar = passing_bar(title, "programs", self._n_built, self._began)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._n_waiting -= 1
+                if self._bar is not None and not self._n_waiting:
+                    self._bar.close()
+                    self._bar = None
+
+    def _count(self):
+        with self._lock:
+            self._n_built += 1
+            if self._n_built == 1 and is_watched():
+                print(f"compiling kernels for {self.device}, once", file=sys.stderr, flush=True)
+            if self._bar is not None:
+                self._bar.update()
+
+
+def compile_beside(device):
+    """Starts a process that compiles products while this one tests a device at its first use.
+
+    PoCL compiles one program at a time in a process, but processes share its cache. The self-test
+    compiles four products; those of turned operators and of sources' boxes are in the cache soon
+    after. The process ends by itself, prints nothing, and does no harm if it fails.
+
+    device: a Device; nothing is done for other platforms than PoCL, or without a second core
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    if device.platform != PLATFORM or device.kind != "CPU" or n_cores < 2 or not sys.executable:
+        return
+    module = f"{__package__}.prebuild"
+    command = [sys.executable, "-m", module, f"{device.platform}:{device.name}"]
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    with suppress(OSError):
+        process = subprocess.Popen(command, **quiet)
+        threading.Thread(target=process.wait, daemon=True).start()

@@ -28,6 +28,8 @@ ROW_TILES = 8
 # Terms added in one iteration of the CPU kernel's loop, KU of contract.h. Partial sums have a
 # multiple of this number of terms.
 TERMS = 4
+# Stages after a product, as the kernels for CPUs number them.
+EPILOGUES = (None, "MIX", "TWIST")
 # Largest number of terms that the GPU kernel adds in a single sum: partial sums would take half of
 # a GPU's registers.
 ONE_SUM = 256
@@ -156,8 +158,8 @@ class Contraction:
     ):
         self.device, self.dtype = device, dtype
         self.tuning = tuning or Tuning.of(device, dtype)
-        self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
-        self.options |= {epilogue: True} if epilogue else {}
+        self.options = {"RAGGED": ragged, "STRIDED": strided}
+        self.epilogue, self.sign = epilogue, -1 if adjoint else 1
 
     def build(self, n_rows=None, n_terms=0, n=0):
         """(file, macros) for numbers of rows, terms and columns; by default the largest."""
@@ -166,7 +168,8 @@ class Contraction:
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
             return FILE, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
-        return GROUP_FILE, self.options | tile | {"TWO_SUMS": two_sums}
+        stage = {"SIGN": self.sign} | ({self.epilogue: True} if self.epilogue else {})
+        return GROUP_FILE, self.options | stage | tile | {"TWO_SUMS": two_sums}
 
     def bind(
         self,
@@ -194,7 +197,9 @@ class Contraction:
         whole_a = a.step == 1 and a.stride == m * a.ld and a.items_per_matrix == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, n)
-        tile = tile | {"OWN": own is not None}
+        stage = {"epilogue": EPILOGUES.index(self.epilogue), "sign": self.sign}
+        if "KB" in tile:
+            tile, stage = tile | {"OWN": own is not None}, {}
         which = own and own.table_index
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
@@ -229,6 +234,7 @@ class Contraction:
             n_bands=n_bands,
             which=which,
             own=sizes,
+            **stage,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
         return BoundContraction(launch, tile, m, self._extent(tile, n), starts if tall else None)
@@ -279,6 +285,22 @@ class BoundContraction:
     def _launch(self, m, batch, given):
         n_y = _groups(-(-m // self.rows), self.group_rows)
         self.launch((self.n_x, n_y, batch), **given)
+
+
+def box_product(device, dtype, *, strided, ragged, tuning=None):
+    """Launcher of kernels/boxed.cl; see `BoxedProduct` of the solver for its layouts."""
+    tuning = tuning or Tuning.of(device, dtype)
+    tile, on_cpu = tuning.tile_for_boxes, tuning.row_loops
+    return device.launcher(
+        "boxed.cl",
+        "multiply_boxes",
+        dtype=dtype,
+        local_size=(tile["WGX"], tile["WGY"], 1),
+        STRIDED=strided,
+        RAGGED=ragged and not on_cpu,  # there an argument
+        ON_CPU=on_cpu,
+        **tile,
+    )
 
 
 def _groups(n, group):

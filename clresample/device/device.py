@@ -21,6 +21,7 @@ import weakref
 import numpy as np
 
 from . import selftest
+from .compiling import compile_beside
 from .device_cache import DeviceCache, DeviceWarning
 from .discovery import (
     DeviceError,
@@ -188,7 +189,9 @@ class Device:
 
     def launch(self, kernel, global_size, local_size=None):
         """Queues a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
-        return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
+        event = self._call(self._enqueue, self.queue, kernel, global_size, local_size)
+        self._programs.notice.wait_for_first_launch(kernel, self.finish)
+        return event
 
     def finish(self, queue=None):
         """Waits until all queued work is done, here or in another in-order queue."""
@@ -329,6 +332,8 @@ def _fault(cl_device):
     """Reason not to use a pyopencl device, or None."""
     try:
         device = _open(cl_device)
+        if not selftest.has_passed(device.remembered):
+            compile_beside(device)
         return selftest.self_test_fault(device, device.remembered)
     except (DeviceError, load_pyopencl().Error) as error:
         return f"{cl_device.name.strip()} fails its self-test: {error}"

@@ -50,8 +50,6 @@ class MirrorContraction(Contraction):
         super().__init__(device, dtype, **options)
         self.right, self.back = side == "right", back
         self.options |= {"SIDE": int(self.right)}
-        if not self.right and not back and "TWIST" not in self.options:
-            self.options["MIX"] = True  # one build with and without its tables
 
     def build(self, n_rows=None, n_terms=0, n=0):
         """See `Contraction.build`; n_rows does not matter."""
@@ -84,17 +82,12 @@ def operator_programs(device, dtype):
 
     returns [(file, dtype, macros)], the requests of `Device.build_ahead`
     """
-    taken = {"epilogue": "MIX", "adjoint": True}
-    turned = {"epilogue": "TWIST", "adjoint": True}
     products = [
         fourier_contraction(device, dtype, "right"),
         fourier_contraction(device, dtype, "left", epilogue="MIX"),
         fourier_contraction(device, dtype, "left", back=True),
         fourier_contraction(device, dtype, "right", back=True, ragged=True),
-        fourier_contraction(device, dtype, "left", **taken),
-        fourier_contraction(device, dtype, "left", **turned),
         Contraction(device, dtype, epilogue="TWIST"),
-        Contraction(device, dtype, **taken),
     ]
     builds = [product.build() for product in products]
-    return [(file, dtype, macros | {"OWN": False}) for file, macros in builds]
+    return [(file, dtype, macros) for file, macros in builds]

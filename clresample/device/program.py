@@ -84,7 +84,7 @@ class Programs:
     def __init__(self, device):
         self.device = device
         self._programs, self._kernels = {}, {}
-        self._notice = CompilationNotice(device.name)
+        self.notice = CompilationNotice(device.name)
 
     def kernel(self, file, name, dtype, defines):
         """A pyopencl.Kernel with its scalars' types, and {argument: True for a buffer}.
@@ -139,7 +139,7 @@ class Programs:
             raise float64_error(device)
         program = cl.Program(device.context, source_of(file, dtype, defines))
         try:
-            return self._notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
+            return self.notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
         except cl.Error as error:
             raise build_error(device, file, defines, build_log(error)) from error
 

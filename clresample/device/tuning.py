@@ -170,18 +170,19 @@ class Tuning:
             return self.tile | {"MR": middle if middle in choices else max(choices)}
         return self.tile | {"MR": min(choices, key=covered)}
 
+    @property
+    def tile_for_boxes(self) -> dict[str, int]:
+        """The tile of boxed.cl."""
+        return self.box_tile or self.tile
+
     def tile_for_columns(self, n, n_pad) -> dict[str, int]:
         """The tile for rows of `n` columns, of `n_pad` in whole vectors, on CPUs.
 
-        Two vectors at a time are the default. If they would leave a single one, which uses half of
-        the registers: five at a time, if five leave none. If at least half of the last float32
-        vector is empty and there are few vectors: two of half the width, of which the empty one is
-        not summed. With more columns this gains less than the 2 % that half vectors take longer.
+        If at least half of the last float32 vector is empty and there are few vectors: two of half
+        the width, of which the empty one is not summed. With more columns this gains less than the
+        2 % that half vectors take longer.
         """
         tile = self.tile
-        two = tile["NV"] == 2 and tile["MR"] == 8
-        if two and n_pad % (5 * tile["VW"]) == 0 and n_pad // tile["VW"] % 2:
-            return tile | {"NV": 5, "MR": 4}
         if tile["VW"] == 16 and tile["NV"] == 1 and n <= 128 and 1 <= n % 16 <= 8:
             return tile | {"VW": 8, "NV": 2}
         return tile

@@ -21,7 +21,7 @@ class ProgressBar:
     def __init__(self, total, unit):
         self.total, self.unit = total, unit
         self._began = self._said = time.monotonic()
-        self._bar = self._drawn() if _is_watched() else None
+        self._bar = _drawn(total=total, unit=f" {unit}") if is_watched() else None
 
     def __enter__(self):
         return self
@@ -41,13 +41,23 @@ class ProgressBar:
             tell(line)
             self._said = now
 
-    def _drawn(self):
-        """tqdm's own choice between a notebook's bar and a terminal's."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # notebooks without widgets get text
-            from tqdm.auto import tqdm
 
-            return tqdm(total=self.total, unit=f" {self.unit}")
+def passing_bar(title, unit, n_done, began):
+    """A tqdm bar of an unknown total, erased when closed; `began` [s] by time.monotonic."""
+    shape = "{desc}: {n_fmt} {unit}, {elapsed}"
+    bar = _drawn(desc=title, unit=unit, initial=n_done, bar_format=shape, leave=False)
+    bar.start_t -= time.monotonic() - began
+    bar.refresh()
+    return bar
+
+
+def _drawn(**options):
+    """tqdm's own choice between a notebook's bar and a terminal's."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of notebooks without widgets: they get text
+        from tqdm.auto import tqdm
+
+        return tqdm(**options)
 
 
 def tell(line):
@@ -60,6 +70,6 @@ def tell(line):
         print(line, file=sys.stderr, flush=True)
 
 
-def _is_watched():
+def is_watched():
     """Returns True if the output is interactive: a terminal, or a notebook's kernel."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

@@ -17,10 +17,15 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True)
 class KeyRule:
-    """Rule of a key: `text` describes valid values to the user, `fits(value)` tests one."""
+    """Rule of a key.
+
+    text: valid values, for messages and editors; fits(value): tests one; schema: the same test as
+        JSON Schema
+    """
 
     text: str
     fits: object
+    schema: dict
 
 
 def is_number(value):
@@ -59,15 +64,53 @@ def _above(value):
     return is_number(value) and value > 0
 
 
-TEXT = KeyRule("a text", is_text)
-FRACTION = KeyRule("a number x with 0 <= x < 1", lambda value: is_number(value) and 0 <= value < 1)
-COUNT = KeyRule("a whole number, 0 or more", is_whole)
-FILE = KeyRule("the name of a file", is_text)
-HDU = KeyRule('a number from 0, "NAME" or "NAME,VERSION"', is_any_of(is_whole, is_text))
-NUMBERS = KeyRule("a number, or a list with one for each channel", one_or_many(is_number))
-SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool))
-SHIFTS = KeyRule('true, false or "auto"', lambda value: isinstance(value, bool) or value == "auto")
-POSITIVE = KeyRule("a number above 0", _above)
+# The tests above as JSON Schema.
+SOME_TEXT = {"type": "string", "pattern": r"\S"}
+NUMBER, WHOLE = {"type": "number"}, {"type": "integer", "minimum": 0}
+ABOVE_ZERO = NUMBER | {"exclusiveMinimum": 0}
+
+
+def any_schema(*schemas):
+    """JSON Schema of values that fit one of several."""
+    return {"anyOf": list(schemas)}
+
+
+def list_schema(*schemas, **limits):
+    """JSON Schema of lists, not empty, of items that fit one of several."""
+    items = schemas[0] if len(schemas) == 1 else any_schema(*schemas)
+    return {"type": "array", "items": items, "minItems": 1, **limits}
+
+
+def one_or_many_schema(*schemas):
+    """JSON Schema of what `one_or_many` tests."""
+    return any_schema(*schemas, list_schema(*schemas))
+
+
+TEXT = KeyRule("a text", is_text, SOME_TEXT)
+FRACTION = KeyRule(
+    "a number x with 0 <= x < 1",
+    lambda value: is_number(value) and 0 <= value < 1,
+    NUMBER | {"minimum": 0, "exclusiveMaximum": 1},
+)
+COUNT = KeyRule("a whole number, 0 or more", is_whole, WHOLE)
+FILE = KeyRule("the name of a file", is_text, SOME_TEXT)
+HDU = KeyRule(
+    'a number from 0, "NAME" or "NAME,VERSION"',
+    is_any_of(is_whole, is_text),
+    any_schema(WHOLE, SOME_TEXT),
+)
+NUMBERS = KeyRule(
+    "a number, or a list with one for each channel",
+    one_or_many(is_number),
+    one_or_many_schema(NUMBER),
+)
+SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool), {"type": "boolean"})
+SHIFTS = KeyRule(
+    'true, false or "auto"',
+    lambda value: isinstance(value, bool) or value == "auto",
+    any_schema({"type": "boolean"}, {"enum": ["auto"]}),
+)
+POSITIVE = KeyRule("a number above 0", _above, ABOVE_ZERO)
 
 # Tables that scene files and field files share; that of an image: fields/field_toml/keys.py.
 TABLES = {
@@ -78,12 +121,16 @@ TABLES = {
     },
     "detection": {
         "threshold": POSITIVE,
-        "passes": KeyRule("1, or 2 to look at the residuals too", lambda value: value in (1, 2)),
+        "passes": KeyRule(
+            "1, or 2 to look at the residuals too", lambda value: value in (1, 2), {"enum": [1, 2]}
+        ),
     },
     "frame": {
         "reference": TEXT,
         "footprint": KeyRule(
-            '"union" or "intersection"', lambda value: value in ("union", "intersection")
+            '"union" or "intersection"',
+            lambda value: value in ("union", "intersection"),
+            {"enum": ["union", "intersection"]},
         ),
         "psf_sigma_px": POSITIVE,
     },

@@ -17,7 +17,7 @@ def check_tiles(path, hdu):
     """Raises FileError if an HCOMPRESS tile has another size than in its header.
 
     astropy (up to 8.0 at least) allocates memory by the header and writes by the tile's own size,
-    beyond the end of that memory.
+    beyond the end of that memory: tools/astropy_hcompress.md is a report of it for astropy.
     """
     if not isinstance(hdu, fits.CompImageHDU) or hdu.compression_type != "HCOMPRESS_1":
         return

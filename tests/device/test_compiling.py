@@ -2,6 +2,7 @@
 
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,5 +23,18 @@ def test_a_build_from_source_is_announced_once_in_a_terminal(monkeypatch, capsys
     notice = CompilationNotice("EPYC")
     assert notice.build(lambda: "cached") == "cached"
     assert capsys.readouterr().err == ""
-    assert [notice.build(compile_slowly) for _ in range(2)] == ["program"] * 2
-    assert capsys.readouterr().err == "compiling kernels for EPYC, once\n" * is_terminal
+    assert [notice.build(compile_slowly) for _ in range(3)] == ["program"] * 3
+    lines = capsys.readouterr().err
+    assert lines.count("compiling kernels for EPYC, once\n") == is_terminal
+    counts = ["EPYC: 1 programs" in lines, "EPYC: 2 programs" in lines]
+    assert counts == [is_terminal] * 2 and (lines.endswith("\r") or not lines)
+
+
+@pytest.mark.parametrize("is_cold", [False, True])
+def test_first_launches_are_waited_for_where_kernels_are_compiled(monkeypatch, is_cold):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    notice, kernel, waits = CompilationNotice("EPYC"), SimpleNamespace(int_ptr=7), []
+    notice.build(compile_slowly if is_cold else lambda: "cached")
+    for _ in range(2):
+        notice.wait_for_first_launch(kernel, lambda: waits.append(1))
+    assert len(waits) == is_cold

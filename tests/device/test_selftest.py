@@ -8,9 +8,8 @@ import pytest
 from helpers.checkout import run_python
 
 from clresample import Device, DeviceError, get_device
-from clresample.device import device as device_module, discovery, selftest
+from clresample.device import device as device_module, discovery, program, selftest
 from clresample.device.device_cache import DeviceCache, DeviceWarning
-from clresample.device.program import Programs
 
 
 @pytest.fixture
@@ -25,15 +24,13 @@ def empty_cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def wrong(monkeypatch):
-    """Transfer functions are conjugated: what a wrong driver, or kernel, could do."""
-    build = Programs._built
+    """Transfer functions are wrong: what a wrong driver, or kernel, could do."""
+    source_of = program.source_of
 
-    def other(self, file, dtype, defines):
-        if defines.get("MIX"):
-            defines = defines | {"SIGN": -defines["SIGN"]}
-        return build(self, file, dtype, defines)
+    def other(file, dtype, defines):
+        return source_of(file, dtype, defines).replace("EVEN(c) - ODD(s)", "EVEN(c) + ODD(s)")
 
-    monkeypatch.setattr(Programs, "_built", other)
+    monkeypatch.setattr(program, "source_of", other)
 
 
 def test_the_render_is_numpys(device):

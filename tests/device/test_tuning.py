@@ -101,7 +101,7 @@ def test_candidates_build_what_they_say():
         ("AVX2", 121, (1, 16)),  # more than half of the last one is full
         ("AVX2", 112, (1, 16)),
         ("AVX2", 130, (1, 16)),  # one of nine
-        ("wide CPU", 74, (5, 16)),  # five vectors, which two at a time leave one of
+        ("wide CPU", 74, (2, 16)),
         ("wide CPU", 90, (2, 16)),
         ("wide CPU", 114, (2, 16)),
         ("CPU", 114, (1, 8)),

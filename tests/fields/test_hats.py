@@ -129,3 +129,9 @@ def test_lsdb_opens_it(table, tmp_path):
     own = lsdb.open_catalog(str(folder))
     matched = catalogue.crossmatch(own, radius_arcsec=0.1, suffixes=("_a", "_b")).compute()
     assert (matched["id_a"] == matched["id_b"]).sum() == 900
+
+
+def test_the_validator_of_hats_finds_no_fault(table, tmp_path):
+    validation = pytest.importorskip("hats.io.validation", reason="hats, the package, is missing")
+    folder = write_hats(tmp_path / "hats", table, most_rows=100)
+    assert validation.is_valid_catalog(folder, strict=True, verbose=False)

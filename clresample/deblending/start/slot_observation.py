@@ -55,14 +55,14 @@ class SlotObservation:
     def _launch(self, name, size, *, local_size=None, **arguments):
         """Queues a kernel of start.cl; K of them: images of a slot that are summed."""
         n_images = arguments.pop("K", 1)
-        sums = {"WG": self.tuning.sum_group, "K": n_images} if local_size else {}
         launch = self.device.launcher(
             FILE,
             name,
             dtype=self.dtype,
             local_size=local_size or self.tuning.local_size(3),
             ROWS=self.tuning.row_loops,
-            **sums,
+            WG=self.tuning.sum_group,
+            K=n_images,
         )
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 

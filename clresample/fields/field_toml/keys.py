@@ -5,15 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...files.scene_keys import (
+    ABOVE_ZERO,
     COUNT,
     FRACTION,
     HDU,
+    NUMBER,
     NUMBERS,
     POSITIVE,
+    SOME_TEXT,
     TABLES,
     TEXT,
+    WHOLE,
     KeyRule,
     SceneError,
+    any_schema,
     check_names,
     check_table,
     is_any_of,
@@ -21,21 +26,30 @@ from ...files.scene_keys import (
     is_number,
     is_text,
     is_whole,
+    list_schema,
     one_or_many,
+    one_or_many_schema,
     read_tables,
 )
 from ..plugins import Formats
 from ..psfs.read import FORMATS
 from ..readers.formats import READERS
 
-FILES = KeyRule("the name of a file, or a list with one for each channel", one_or_many(is_text))
-NAMES = KeyRule("a name, or a list of names", one_or_many(is_text))
+TEXTS = one_or_many_schema(SOME_TEXT)
+TWO_NUMBERS = list_schema(NUMBER, minItems=2, maxItems=2)
+FILES = KeyRule(
+    "the name of a file, or a list with one for each channel", one_or_many(is_text), TEXTS
+)
+NAMES = KeyRule("a name, or a list of names", one_or_many(is_text), TEXTS)
 BANDS = KeyRule(
-    "numbers from 0 or names of the file's bands, one or a list", one_or_many(is_whole, is_text)
+    "numbers from 0 or names of the file's bands, one or a list",
+    one_or_many(is_whole, is_text),
+    one_or_many_schema(WHOLE, SOME_TEXT),
 )
 PLANES = KeyRule(
     "the name of a file, a number above 0, or a list with one for each channel",
     one_or_many(is_text, POSITIVE.fits),
+    one_or_many_schema(SOME_TEXT, ABOVE_ZERO),
 )
 
 
@@ -54,12 +68,19 @@ class OneOf:
         """The permitted names as messages quote them."""
         return " or ".join(f'"{form}"' for form in self.formats)
 
+    @property
+    def schema(self):
+        """The names as JSON Schema."""
+        return {"enum": list(self.formats)}
+
     def fits(self, value):
         """Returns True if a value is one of the names."""
         return isinstance(value, str) and value in self.formats
 
 
-PAIR = KeyRule("a number, or two: [y, x]", is_any_of(is_number, _is_pair))
+PAIR = KeyRule(
+    "a number, or two: [y, x]", is_any_of(is_number, _is_pair), any_schema(NUMBER, TWO_NUMBERS)
+)
 
 # An [[observation]] of a scene and a [[mosaic]] of a field.
 IMAGE: dict[str, KeyRule | OneOf] = {
@@ -76,14 +97,19 @@ IMAGE: dict[str, KeyRule | OneOf] = {
     "psf_center": KeyRule(
         '"middle", "core" or [y, x]',
         lambda value: value in ("middle", "core") or _is_pair(value),
+        any_schema({"enum": ["middle", "core"]}, TWO_NUMBERS),
     ),
     "psf_spacing": POSITIVE,
     "psf_stamp_px": COUNT,
-    "psf_detector": KeyRule("a whole number, 0 or more, or a name", is_any_of(is_whole, is_text)),
+    "psf_detector": KeyRule(
+        "a whole number, 0 or more, or a name",
+        is_any_of(is_whole, is_text),
+        any_schema(WHOLE, SOME_TEXT),
+    ),
     "psf_cell_px": PAIR,
     "psf_origin_px": PAIR,
-    "psf_cutout_px": KeyRule("two numbers: [y, x]", _is_pair),
-    "psf_crpix": KeyRule("two numbers: [CRPIX1, CRPIX2]", _is_pair),
+    "psf_cutout_px": KeyRule("two numbers: [y, x]", _is_pair, TWO_NUMBERS),
+    "psf_crpix": KeyRule("two numbers: [CRPIX1, CRPIX2]", _is_pair, TWO_NUMBERS),
     "weight": PLANES,
     "weight_hdu": HDU,
     "variance": PLANES,
@@ -95,26 +121,38 @@ IMAGE: dict[str, KeyRule | OneOf] = {
     "mask_bits": KeyRule(
         "a list of bits to ignore, by number from 0 or by the name in the mask's header",
         one_or_many(is_whole, is_text),
+        one_or_many_schema(WHOLE, SOME_TEXT),
     ),
     "saturation": KeyRule(
-        "a number above 0, or a list with one for each channel", one_or_many(POSITIVE.fits)
+        "a number above 0, or a list with one for each channel",
+        one_or_many(POSITIVE.fits),
+        one_or_many_schema(ABOVE_ZERO),
     ),
     "zero_point": NUMBERS,
     "background": KeyRule(
         '"subtract", or "none" where it is subtracted already',
         lambda value: value in ("subtract", "none"),
+        {"enum": ["subtract", "none"]},
     ),
     "noise": KeyRule(
-        '"estimate", "white", or the name of a file with the autocorrelation of the noise', is_text
+        '"estimate", "white", or the name of a file with the autocorrelation of the noise',
+        is_text,
+        SOME_TEXT,
     ),
 }
 SHARED = ("name", "channels", "band", "mask_bits", "zero_point", "background", "saturation")
 SURVEY: dict[str, KeyRule | OneOf] = {  # the same of a survey's files
     "format": OneOf(READERS),
-    "path": KeyRule("the name of a folder or a file, or a list of files", one_or_many(is_text)),
-    "bands": KeyRule("a list of the format's bands", one_or_many(is_text)),
+    "path": KeyRule(
+        "the name of a folder or a file, or a list of files", one_or_many(is_text), TEXTS
+    ),
+    "bands": KeyRule("a list of the format's bands", one_or_many(is_text), TEXTS),
     **{key: IMAGE[key] for key in (*SHARED, *(key for key in IMAGE if key.startswith("psf")))},
-    "noise": KeyRule('"estimate", or "white"', lambda value: value in ("estimate", "white")),
+    "noise": KeyRule(
+        '"estimate", or "white"',
+        lambda value: value in ("estimate", "white"),
+        {"enum": ["estimate", "white"]},
+    ),
 }
 SCENE_TABLES = {"observation": IMAGE} | TABLES
 FIELD_TABLES = {

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ....device.contraction import round_up_columns, terms_per_block
+from ....device.contraction import box_product, round_up_columns, terms_per_block
 
 # The columns of the kernel's table, each int64.
 COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "ld_b", "skip"]
@@ -26,23 +26,18 @@ class BoxedProduct:
     def __init__(self, buffers, *, strided=False, ragged=False, inward=True, **sizes):
         b, sizes = buffers, {"next_a": 1, "next_c": 1, "skip": 0} | sizes
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
-        tile, m, width = b.tuning.box_tile or b.tuning.tile, max(items[0]), max(items[1] + items[8])
+        tile, m, width = b.tuning.tile_for_boxes, max(items[0]), max(items[1] + items[8])
         group = tile["WGX"], tile["WGY"]
         along = math.ceil(round_up_columns(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
         self._size = tuple(math.ceil(n / g) * g for n, g in zip(map(math.ceil, tiles), group))
-        self._launch = b.device.launcher(
-            "boxed.cl",
-            "multiply_boxes",
-            dtype=b.dtype,
-            local_size=(*group, 1),
-            STRIDED=strided,
-            RAGGED=ragged,
-            **tile,
+        self._launch = box_product(
+            b.device, b.dtype, strided=strided, ragged=ragged, tuning=b.tuning
         ).bind(
             items=b.device.put(np.stack(items, axis=1), np.int64),
             block=terms_per_block(int(max(items[2]))),
             inward=inward,
+            ragged=ragged,
         )
 
     def __call__(self, a, b, c, active, *, add=False):
