@@ -103,8 +103,8 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
         hg_new[index[k]] = more ? hg_new[index[k]] + wp[k] : wp[k];
     }
 #else
-    /* A panel's rows side by side, COLUMNS work-items each, which read neighbours; their sums go down
-     * the same panel's columns, of which a work-item has every WG-th, while a cache holds them. */
+    /* The rows of a panel side by side, with COLUMNS work-items each, which read adjacent values.
+     * The panel is read again for its columns, while it is in a cache: every WG-th of them. */
     const int row = lid / COLUMNS, column = lid % COLUMNS;
     REAL sum_y[MAX_BLOCK / WG], sum_p[MAX_BLOCK / WG];
     for (int q = 0; q < MAX_BLOCK / WG; ++q) sum_y[q] = sum_p[q] = 0;

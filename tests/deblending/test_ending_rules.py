@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.told import CPU
 
 from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _BatchRunner
@@ -28,7 +29,8 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
     """_BatchRunner on their way and the group (index, Fit) of these names."""
     many = object.__new__(_BatchRunner)
     many.blends, many.done, many.memory = list(names), [None] * len(names), memory
-    many.settings = many.device = many.dtype = None
+    many.settings = many.dtype = None
+    many.device = CPU
     many.warned = {}
     group = [
         (

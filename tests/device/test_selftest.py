@@ -28,7 +28,7 @@ def wrong(monkeypatch):
     source_of = program.source_of
 
     def other(file, dtype, defines):
-        return source_of(file, dtype, defines).replace("EVEN(c) - ODD(s)", "EVEN(c) + ODD(s)")
+        return source_of(file, dtype, defines).replace("(cc) - (ss)", "(cc) + (ss)")
 
     monkeypatch.setattr(program, "source_of", other)
 

@@ -79,7 +79,7 @@ def test_results_are_equal_to_rounding_with_all_tiles(device, kept):
 def test_sizes_that_are_none_are_ignored_in_one_line(device, kept, content):
     kept.write(PART, content)
     device.remembered = DeviceCache(device.cl)
-    with pytest.warns(DeviceWarning, match="is ignored: its sizes are none") as caught:
+    with pytest.warns(DeviceWarning, match="is ignored: its sizes are not those") as caught:
         assert Tuning.of(device) == Tuning.untuned(device)
         assert Tuning.of(device) == Tuning.untuned(device)
     assert len(caught) == 1

@@ -103,9 +103,7 @@ class ProfileFit:
     def _run_without_doubt(self, scenes):
         """Fits some scenes again without contamination of their shapes; the better fit stays.
 
-        The better fit has the lower chi2 with the priors, which include the contamination by the
-        neighbours of that fit. If one of two similar galaxies has the other one's light, the
-        other one's shape is contaminated only for this reason.
+        If one of two similar galaxies has the other one's light, that one's shape is contaminated.
         """
         if len(scenes):
             before = self._copy()
@@ -147,10 +145,7 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes, *, doubt=True):
-        """Solves some scenes at their present parameters and stores the inputs of a step.
-
-        doubt: of shapes beside other sources, or none of them
-        """
+        """Solves some scenes and stores a step's inputs; doubt: contaminate blended shapes."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
