@@ -67,15 +67,12 @@ class ProfileFit:
     def run(self):
         """Steps until all scenes have ended; starts those with large galaxies in two ways."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        self._run(np.flatnonzero(some))
+        self._step(np.flatnonzero(some), learn=True)
         scenes = self._with_large_galaxies()
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
-
-    def _run(self, scenes, *, learn=True):
-        self._step(scenes, np.ones(self.source.shape, bool), N_STEPS, learn=learn)
 
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
@@ -92,7 +89,7 @@ class ProfileFit:
         self.looking.solve(MODEL_ERROR)
         first_profiles(self, scenes, MODEL_ERROR)
         self._take(scenes)
-        self._run(scenes)
+        self._step(scenes, learn=True)
         self._restore(before, scenes[chi2 <= self._chi2_as_expected(scenes)])
 
     def _chi2_as_expected(self, scenes):
@@ -108,7 +105,7 @@ class ProfileFit:
         if len(scenes):
             before = self._copy()
             self._take(scenes, doubt=False)
-            self._run(scenes, learn=False)
+            self._step(scenes)
             self._take(scenes)
             self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
 
@@ -157,10 +154,11 @@ class ProfileFit:
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
-    def _step(self, scenes, free, n_steps, *, learn=False):
+    def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
         """Step until some scenes have ended; free (B, n): the components that move."""
         live = np.isin(np.arange(len(self.theta)), scenes)
         damping = np.full(len(live), FIRST_DAMPING)
+        free = np.ones(self.source.shape, bool) if free is None else free
         for i_step in range(n_steps):
             scenes = np.flatnonzero(live)
             step, expected = self._next_step(scenes, damping[scenes], free[scenes])
