@@ -145,6 +145,8 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
     # components of one source do not doubt each other, and one without light is not doubted
     np.testing.assert_allclose(contamination_factors(normal, light[None], 0 * source), 1)
+    apart = np.where(np.eye(3), normal, -1e-20)  # rounding
+    np.testing.assert_allclose(contamination_factors(apart, light[None], source), 1)
     dark = contamination_factors(normal, light[None] * [1, 0, 1], source)[0]
     assert dark[1] == 1 and (dark[[0, 2]] < found[[0, 2]]).all()
 

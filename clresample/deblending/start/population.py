@@ -148,10 +148,11 @@ def contamination_factors(normal, spectra, source):
     """
     light = (spectra[:, :, :, None] * normal * spectra[:, :, None]).sum(axis=1)
     own = np.einsum("kii->ki", light)
-    light = light * (source[:, :, None] != source[:, None])
+    # products of separate sources may be negative by rounding
+    light = np.maximum(light, 0) * (source[:, :, None] != source[:, None])
     beside, size = light.sum(axis=2), np.sqrt(own)
     alike = size[:, :, None] / np.maximum(np.maximum(size[:, :, None], size[:, None]), 1e-30)
-    alike = (light * alike).sum(axis=2) / np.maximum(beside, 1e-30)
+    alike = (light * alike).sum(axis=2) / np.where(beside > 0, beside, 1)
     beyond = np.maximum(beside - OWN_LIGHT * alike * own, 0)
     return 1 + NEIGHBOUR_MODEL_ERROR**2 * np.divide(
         beyond**2, own, out=np.zeros_like(own), where=own > 0
