@@ -11,7 +11,7 @@ from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
 from .first_profiles import first_profiles
 from .linearised_scenes import LinearisedScenes
-from .population import PopulationPrior, contamination_factors
+from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 
 # Longest step of a parameter: the quadratic model of chi2 is not valid far from the minimum.
 LONGEST_STEP = 0.7
@@ -23,7 +23,7 @@ N_FIRST_STEPS = 5
 # by this in ln sigma, or if chi2 per pixel is above MAX_CHI2. No start of simulated COSMOS scenes
 # (seeds 0 to 23, and blends of 20) is beyond 0.74 and 1.06; second starts that differed from first
 # ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
-MAX_GROWTH, MAX_CHI2 = 0.9, 1.2
+MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # Levenberg-Marquardt: damping of the first step relative to the normal matrix's diagonal, its
 # divisor after a successful step, its factor after a rejected one, and its largest value.
 FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
@@ -38,6 +38,7 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
+    own_light (B, 1): OWN_LIGHT in scenes with large galaxies, 0 in others
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -51,7 +52,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness = np.zeros(len(shapes))
+        self.brightness, self.own_light = np.zeros(len(shapes)), np.zeros((size[0], 1))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -83,6 +84,7 @@ class ProfileFit:
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
         before, chi2 = self._copy(), self._chi2_as_expected(scenes)
+        self.own_light[scenes] = OWN_LIGHT
         self.theta[scenes] = self.expected.mean[scenes]
         self.population.reset(scenes, self.expected)
         self._look(scenes, self.theta, slopes=False)
@@ -231,9 +233,8 @@ class ProfileFit:
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        self.population.set_contamination(
-            scenes, contamination_factors(normal, spectra, self.source[scenes])
-        )
+        given = normal, spectra, self.source[scenes], self.own_light[scenes]
+        self.population.set_contamination(scenes, contamination_factors(*given))
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some scenes, priors included."""
