@@ -17,8 +17,7 @@ from .ended import Ended
 # than 4096 pixels need no joint fit.
 MAX_COMPONENTS, MAX_BYTES, MAX_PIXELS = 2000, 8 << 30, 1 << 24
 # [bytes] Memory of a fit for each pixel of a component's box, for bright galaxies, and for each
-# pixel
-# of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
+# pixel of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
 BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 
 
