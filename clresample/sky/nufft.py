@@ -18,8 +18,7 @@ from scipy.fft import fft2, next_fast_len
 from scipy.special import i0e
 
 # Number of grid elements along an axis for each frequency, and the padding factor. Fewer taps are
-# less
-# accurate (12: 1e-11); more padding takes more memory.
+# less accurate (12: 1e-11); more padding takes more memory.
 TAPS, PADDING = 16, 2.0
 # The window's shape parameter for the smallest side lobes beyond the padded grid.
 BETA = np.pi * np.sqrt((TAPS * (1 - 0.5 / PADDING)) ** 2 - 0.8)

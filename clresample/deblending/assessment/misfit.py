@@ -27,8 +27,7 @@ WRONG_ANYWAY = 2.0
 # accuracy of weights.
 TRUSTED_CHI2 = 1.1
 # [sigma] Smoothed residuals above this count as residual light. Then the mean absolute value of
-# noise
-# above it, in units of the scatter: 2 phi(2).
+# noise above it, in units of the scatter: 2 phi(2).
 LEFT_SIGMAS, LEFT_BY_NOISE = 2.0, 0.108
 # [px] Lags (y, x) at which noise may be correlated although not declared; opposite lags are equal.
 LAGS_PX = (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)

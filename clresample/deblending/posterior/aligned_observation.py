@@ -43,9 +43,8 @@ BAND_PERIOD_PX = 65
 # Number of cached transfer functions, of 0.3 to 1 MB: those of all observations of a field's tile.
 MAX_TRANSFERS = 32
 # Number of elements of a component's images, in its box or rendered, from which several host
-# threads
-# share the work: 100 modes of a galaxy of 100 pixels a side take 20 ms. When threads also shared
-# smaller ones, errors of 300 galaxies of 40 pixels took 4.1 s instead of 2.9 s.
+# threads share the work: 100 modes of a galaxy of 100 pixels a side take 20 ms. When threads also
+# shared smaller ones, errors of 300 galaxies of 40 pixels took 4.1 s instead of 2.9 s.
 MIN_THREADED_ELEMENTS = 1 << 20
 
 

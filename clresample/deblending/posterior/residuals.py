@@ -15,8 +15,7 @@ MISFIT_SIGMAS = 5.0
 # Smallest number of sky pixels to measure how much correlated noise adds up under the filter.
 MIN_PIXELS = 400
 # Largest ratio of the scatter of single sky pixels to that about their neighbours that is
-# attributed
-# to noise: the noise of published weight maps is wrong by 10 to 30 %.
+# attributed to noise: the noise of published weight maps is wrong by 10 to 30 %.
 WRONG_WEIGHTS = 1.3
 # The same ratio for filtered pixels: noise correlated over two pixels by resampling is two or three
 # times larger after the filter than in single pixels.

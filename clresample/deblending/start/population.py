@@ -48,9 +48,8 @@ MIN_GALAXIES = 2
 # galaxies are equal with both.
 STUDENT_DOF = 4.0
 # The same for all four parameters of a single galaxy, before updates: data can override the prior
-# of
-# sizes and wings. The prior of ellipticities is nearly Gaussian: tails of 4 degrees of freedom cost
-# 0.1 dB.
+# of sizes and wings. The prior of ellipticities is nearly Gaussian: tails of 4 degrees of freedom
+# cost 0.1 dB.
 TAILS = np.array([4.0, 1e6, 1e6, 4.0])
 # Relative error of a neighbour's model, of one sign over a whole galaxy. With 0.1 the mean SDR of
 # simulated COSMOS galaxies is 0.1 dB above that without it; with 0.2 the gain is 0.13 dB (joint,

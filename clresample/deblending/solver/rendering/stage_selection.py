@@ -20,10 +20,9 @@ from .windows import WindowGroups, WindowRendering, reach_of
 BOX_COST, SUM_COST = 1.9, 10.0
 # Numbers of cells along a side of a frame that are tried for windows, and the largest ratio of
 # their operations to those of frames. The count is an estimate, and small products, cutting and
-# adding
-# windows take longer: measured times are 1.3 to 2.6 times the estimate, most of all for six bands
-# rotated against the model. With 0.7, six bands of scenes of 256 pixels a side take 1.6 times as
-# long as in frames.
+# adding windows take longer: measured times are 1.3 to 2.6 times the estimate, most of all for six
+# bands rotated against the model. With 0.7, six bands of scenes of 256 pixels a side take 1.6 times
+# as long as in frames.
 CELLS, MAX_WINDOW_COST = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32), 0.4
 # Sources whose boxes exceed the median by this factor may get windows of their own, since the
 # largest box determines the frame of all groups.
