@@ -34,7 +34,6 @@ import io
 import time
 import warnings
 from contextlib import redirect_stdout
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +47,7 @@ from clresample.adapters.optional import require
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import BadOption, Parser, data_folder, positive, run
+from .harness.scarlet2_scene import free_parameters
 
 try:
     import btk
@@ -160,8 +160,6 @@ class Scarlet2(_Images):
 
     def images_of(self, ii, batch):
         """Sources and their images in all bands."""
-        import numpyro.distributions.constraints as constraints
-
         s2, rows = self.package, batch.catalog_list[ii]
         images = batch.blend_images[ii].astype(np.float32)
         weights = np.broadcast_to(1 / sky_of(batch)[:, None, None], images.shape)
@@ -179,17 +177,8 @@ class Scarlet2(_Images):
             for y, x in zip(rows["y_peak"], rows["x_peak"]):
                 place = np.array([y, x], np.float32)
                 s2.Source(place, *self._start(seen, place))
-        step = partial(s2.relative_step, factor=SCARLET2["spectrum"])
-        with s2.Parameters(scene):
-            for i, source in enumerate(scene.sources):
-                s2.Parameter(
-                    source.spectrum, name=f"spectrum:{i}", constraint=constraints.positive,
-                    stepsize=step,
-                )  # fmt: skip
-                s2.Parameter(
-                    source.morphology, name=f"morphology:{i}",
-                    constraint=constraints.unit_interval, stepsize=SCARLET2["morphology"],
-                )  # fmt: skip
+        steps = {name: SCARLET2[name] for name in ("spectrum", "morphology")}
+        free_parameters(s2, scene, **steps)
         limits = {"max_iter": SCARLET2["iterations"], "e_rel": SCARLET2["e_rel"]}
         fitted = scene.fit(seen, progress_bar=False, **limits)
         models = [np.asarray(seen.render(fitted.evaluate_source(s))) for s in fitted.sources]

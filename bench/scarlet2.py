@@ -23,7 +23,6 @@ seconds       of one iteration, compilation left out; median
 from __future__ import annotations
 
 import time
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +45,7 @@ from clresample.adapters.scarlet2 import renderer_of
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import Parser, data_folder, run
+from .harness.scarlet2_scene import free_parameters
 
 CENTER_DEG, ANGLE_DEG, SEED, N_SOURCES = (150.1, 2.2), 12.0, 100, 5
 START_PX, BOX_PX = 3.0, 61  # [model px] sigma of the start's Gaussians, side of their boxes
@@ -183,8 +183,6 @@ class Scarlet2:
 
     def _start(self):
         """A scene of round Gaussians of the true fluxes, its parameters free."""
-        import numpyro.distributions.constraints as constraints
-
         s2 = self.package
         axis = np.arange(BOX_PX) - BOX_PX // 2
         blob = np.exp(-0.5 * (axis[:, None] ** 2 + axis**2) / START_PX**2).astype(np.float32)
@@ -192,17 +190,7 @@ class Scarlet2:
             for place, model in zip(self.truth.positions, self.truth.models):
                 flux = np.maximum(model.sum(axis=(1, 2)), 1e-3).astype(np.float32)
                 s2.Source(np.asarray(place, np.float32), flux / blob.sum(), np.clip(blob, 1e-6, 1))
-        step = partial(s2.relative_step, factor=SPECTRUM_STEP)
-        with s2.Parameters(scene):
-            for i, source in enumerate(scene.sources):
-                s2.Parameter(
-                    source.spectrum, name=f"spectrum:{i}", constraint=constraints.positive,
-                    stepsize=step,
-                )  # fmt: skip
-                s2.Parameter(
-                    source.morphology, name=f"morphology:{i}",
-                    constraint=constraints.unit_interval, stepsize=MORPHOLOGY_STEP,
-                )  # fmt: skip
+        free_parameters(s2, scene, spectrum=SPECTRUM_STEP, morphology=MORPHOLOGY_STEP)
         return scene
 
 

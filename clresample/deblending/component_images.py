@@ -84,3 +84,23 @@ def weighted_sum(rendered, spectra):
     if isinstance(rendered, ComponentImages):
         return rendered.total(spectra)
     return np.einsum("nc,ncyx->cyx", spectra, rendered)
+
+
+def window_of(rendered, i, margin=0):
+    """Slices (y, x) of component i's window and a margin [px] around it, in the observation.
+
+    The whole observation for an array.
+    """
+    whole = [slice(0, n) for n in rendered.shape[-2:]]
+    own = rendered.window(i) if isinstance(rendered, ComponentImages) else whole
+    return tuple(
+        slice(max(part.start - margin, 0), min(part.stop + margin, every.stop))
+        for part, every in zip(own, whole, strict=True)
+    )
+
+
+def image_within(rendered, i, window):
+    """Component i's image (Co, ny, nx) on a window (slices y, x) that contains its own."""
+    if isinstance(rendered, ComponentImages):
+        return rendered.within(i, window)
+    return rendered[i][:, *window]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -10,6 +9,7 @@ import time
 from contextlib import contextmanager, suppress
 
 from ..drawing.bar import is_watched, passing_bar
+from .discovery import n_host_cores
 
 # [s] Processor time of a build: 0.02 from PoCL's or pyopencl's cache, 0.08 and more from source.
 MAX_CACHED_S = 0.04
@@ -85,9 +85,9 @@ def compile_beside(device):
 
     device: a Device; nothing is done for other platforms than PoCL, or without a second core
     """
-    affinity = getattr(os, "sched_getaffinity", None)
-    n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    if device.platform != PLATFORM or device.kind != "CPU" or n_cores < 2 or not sys.executable:
+    if device.platform != PLATFORM or device.kind != "CPU":
+        return
+    if n_host_cores() < 2 or not sys.executable:
         return
     module = f"{__package__}.prebuild"
     command = [sys.executable, "-m", module, f"{device.platform}:{device.name}"]

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from .device import Device, get_device
 from .device_cache import DeviceWarning
-from .discovery import DeviceError, choose, find_devices
+from .discovery import DeviceError, choose, find_devices, n_host_cores
 from .kernel_profiler import report
 
 # Items of a device's first portion, before its speed is known.
@@ -73,8 +73,7 @@ def host_threads(device):
     One for each core of this process, but no more than a CPU device has compute units, which are
     few if processes share the cores.
     """
-    affinity = getattr(os, "sched_getaffinity", None)
-    n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    n_cores = n_host_cores()
     n_units = device.compute_units if device.kind == "CPU" else n_cores
     return min(n_cores, n_units, MAX_THREADS)
 

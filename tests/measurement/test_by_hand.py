@@ -183,6 +183,6 @@ def test_a_window_holds_the_light_of_all_components():
     rendered = ComponentImages.cropped(
         (2, 1, 40, 40), np.array([[3, 4], [20, 25]]), [np.ones((1, 6, 7)), np.ones((1, 8, 9))]
     )
-    assert _window(rendered, [0, 1], (40, 40)) == (slice(3, 28), slice(4, 34))
-    assert _window(rendered, [1], (40, 40)) == (slice(20, 28), slice(25, 34))
-    assert _window(np.ones((2, 1, 40, 41)), [0, 1], (40, 41)) == (slice(0, 40), slice(0, 41))
+    assert _window(rendered, [0, 1]) == (slice(3, 28), slice(4, 34))
+    assert _window(rendered, [1]) == (slice(20, 28), slice(25, 34))
+    assert _window(np.ones((2, 1, 40, 41)), [0, 1]) == (slice(0, 40), slice(0, 41))

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.sources import PointSource
-from ..component_images import ComponentImages
+from ..component_images import image_within, window_of
 
 # [FWHM] sigma of the Gaussian by which a point is blurred.
 WIDTH_FWHM = 1.0
@@ -47,31 +47,13 @@ def _products(result, i_observation, k, light, left):
 
     observation, rendered = result.observations[i_observation], result.rendered[i_observation]
     width = WIDTH_FWHM * observation.psf.fwhm_px
-    window = _window(rendered, k, int(np.ceil(MARGIN * width.max())))
-    image = _within(rendered, k, window)
+    window = window_of(rendered, k, int(np.ceil(MARGIN * width.max())))
+    image = image_within(rendered, k, window)
     wide = [gaussian_filter(a, s, mode="constant") for a, s in zip(image, width, strict=True)]
-    root = np.sqrt(observation.whitened.weights[:, *window]) * left.used[:, *window]
+    scale = 1 / np.sqrt(left.noise)[:, None, None]
+    root = scale * np.sqrt(observation.whitened.weights[:, *window]) * left.used[:, *window]
     u, g = (root * light * observation.whiten(a) for a in (image, np.array(wide)))
     power = (u * u).sum(axis=(1, 2))
     shared = np.divide((u * g).sum(axis=(1, 2)), power, out=np.zeros_like(power), where=power > 0)
-    g = (g - shared[:, None, None] * u) / left.noise[:, None, None]
-    residual = left.residual[:, *window]
-    return (g * residual).sum(), (g * g * left.noise[:, None, None]).sum()
-
-
-def _window(rendered, k, margin):
-    """Slices (y, x) of component k's image and a margin [px] about it, inside the observation."""
-    if not isinstance(rendered, ComponentImages):
-        return slice(0, rendered.shape[-2]), slice(0, rendered.shape[-1])
-    own, shape = rendered.window(k), rendered.shape[-2:]
-    return tuple(
-        slice(max(part.start - margin, 0), min(part.stop + margin, n))
-        for part, n in zip(own, shape, strict=True)
-    )
-
-
-def _within(rendered, k, window):
-    """Component k's image (Co, ny, nx) on that window."""
-    if isinstance(rendered, ComponentImages):
-        return rendered.within(k, window)
-    return np.asarray(rendered[k])
+    g = g - shared[:, None, None] * u
+    return (g * scale * left.residual[:, *window]).sum(), (g * g).sum()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
-from ..component_images import ComponentImages
+from ..component_images import image_within, window_of
 
 # [sigma] Filtered residual from which a source is flagged as misfitted: noise reaches it in one of
 # 20 large blends, each with 1e5 pixels in all channels.
@@ -212,7 +212,7 @@ def pixels_in_boxes(result, i_observation, positions):
     owners = np.array([c.source for c in result.components], int)
     for s in np.unique(owners):
         parts = np.flatnonzero(owners == s)
-        window = _window(result.rendered[i_observation], parts, positions.shape)
+        window = _window(result.rendered[i_observation], parts)
         (y, x), inside = np.moveaxis(positions[window], -1, 0), None
         for (y0, x0), (n_y, n_x) in (boxes[i] for i in parts):
             one = (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
@@ -220,11 +220,9 @@ def pixels_in_boxes(result, i_observation, positions):
         yield s, window, inside
 
 
-def _window(rendered, parts, shape):
+def _window(rendered, parts):
     """A window that holds the light of some components, and so their boxes."""
-    if not isinstance(rendered, ComponentImages):
-        return slice(0, shape[0]), slice(0, shape[1])
-    windows = [rendered.window(i) for i in parts]
+    windows = [window_of(rendered, i) for i in parts]
     return tuple(
         slice(min(w[k].start for w in windows), max(w[k].stop for w in windows)) for k in (0, 1)
     )
@@ -234,9 +232,8 @@ def _light(result, i_observation, source, window):
     """One source's model (Co, ny, nx) on a window of an observation."""
     channels = result.channel_slices()[i_observation]
     rendered, total = result.rendered[i_observation], 0.0
-    boxed = isinstance(rendered, ComponentImages)
     for i, c in enumerate(result.components):
         if c.source == source:
-            image = rendered.within(i, window) if boxed else rendered[i][:, *window]
+            image = image_within(rendered, i, window)
             total = total + c.spectrum[channels, None, None] * image
     return total

@@ -178,6 +178,15 @@ class LinearisedScenes:
         right, power = self.light_products(sky, error)
         return np.divide(right, np.sqrt(power), out=np.zeros_like(right), where=power > 0)
 
+    def kept_solution(self):
+        """Copies of the present spectra and sky levels, for `restore`."""
+        return self.spectra.copy(), self.sky.copy()
+
+    def restore(self, kept, scenes):
+        """Restores the spectra and sky levels of some scenes (k,) from a `kept_solution`."""
+        (spectra, sky), here = kept, np.isin(self.scene, scenes)
+        self.spectra[here], self.sky[scenes] = spectra[here], sky[scenes]
+
     def solution(self):
         """The present spectra and sky levels (k, C, n + 1)."""
         out = np.zeros((len(self.scenes), self.n_channels, self.n_most + 1))

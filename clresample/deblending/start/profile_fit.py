@@ -112,17 +112,15 @@ class ProfileFit:
             self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
 
     def _copy(self):
-        """Copies of chi2, theta, spectra, sky and the prior."""
-        looking = self.looking
-        arrays = self.chi2, self.theta, looking.spectra, looking.sky
-        return *(a.copy() for a in arrays), deepcopy(self.population)
+        """Copies of chi2, theta, the solution and the prior."""
+        kept = self.looking.kept_solution(), deepcopy(self.population)
+        return self.chi2.copy(), self.theta.copy(), *kept
 
     def _restore(self, before, scenes):
         """Restores some scenes (k,) from a `_copy`."""
-        looking, (chi2, theta, spectra, sky, population) = self.looking, before
-        here = np.isin(looking.scene, scenes)
+        chi2, theta, solution, population = before
         self.chi2[scenes], self.theta[scenes] = chi2[scenes], theta[scenes]
-        looking.spectra[here], looking.sky[scenes] = spectra[here], sky[scenes]
+        self.looking.restore(solution, scenes)
         self.population.reset(scenes, population)
         self._measure_brightness(self.theta)
 
@@ -201,16 +199,13 @@ class ProfileFit:
 
         Returns the gain (k,), spectra of the better state, and theta (B, n, 4) after it.
         """
-        looking = self.looking
-        trial, before = self.theta.copy(), (looking.spectra.copy(), looking.sky.copy())
+        trial, before = self.theta.copy(), self.looking.kept_solution()
         trial[scenes] += step
         self._look(scenes, trial, slopes=False)
-        looking.solve(MODEL_ERROR)
+        self.looking.solve(MODEL_ERROR)
         new = self._chi2(scenes, trial)
         gain = self.chi2[scenes] - new
-        worse = scenes[~(gain > 0)]
-        back = np.isin(looking.scene, worse)
-        looking.spectra[back], looking.sky[worse] = before[0][back], before[1][worse]
+        self.looking.restore(before, scenes[~(gain > 0)])
         self.chi2[scenes] = np.where(gain > 0, new, self.chi2[scenes])
         return gain, trial
 
