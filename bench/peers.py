@@ -46,7 +46,7 @@ from clresample.adapters.optional import require
 
 from .harness import records
 from .harness.clock import on_all_cores
-from .harness.options import BadOption, Parser, data_folder, positive, run
+from .harness.options import BadOption, Parser, data_folder, run
 from .harness.scarlet2_scene import free_parameters
 
 try:
@@ -62,16 +62,9 @@ except ImportError as error:
 BAND, MAX_GALAXIES, MAX_FOUND, APERTURE_PX = "i", 6, 12, 5.0
 # scarlet2's model PSF [sigma, px], and steps; twice its default of iterations, and its e_rel.
 SCARLET2 = {"sigma": 0.7, "iterations": 200, "e_rel": 1e-4, "spectrum": 0.05, "morphology": 0.01}
-COLUMNS = (
-    ("deblender", 26, ""),
-    ("precision", 9, ".3f"),
-    ("recall", 6, ".3f"),
-    ("rmse", 6, ".2f"),
-    ("psnr", 6, ".2f"),
-    ("ssim", 6, ".4f"),
-    ("iou", 5, ".3f"),
-    ("flux", 6, ".4f"),
-    ("seconds", 7, ".2f"),
+COLUMNS = records.columns(
+    "deblender:26 precision:9.3f recall:6.3f rmse:6.2f psnr:6.2f ssim:6.4f iou:5.3f flux:6.4f "
+    "seconds:7.2f"
 )
 
 
@@ -288,42 +281,45 @@ def draw(path, batch, band, images):
     figure.savefig(path, dpi=100)
 
 
+def deblenders_of(band):
+    """The deblenders by name; without scarlet2 where it is absent, which a line says."""
+    found = {"SEP": Sep(band)}
+    try:
+        found["scarlet2, true places"] = Scarlet2()
+    except ImportError as error:
+        print(f"without scarlet2: {error}")
+    found["clresample, true places"] = Clresample(detects=False)
+    return found | {"clresample": Clresample(detects=True)}
+
+
+def rows_of(batch, band, images):
+    """A row of each deblender; its images of `band` are put into `images` under its name."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of single blends; the table is of all
+        for name, deblender in deblenders_of(band).items():
+            row, images[name] = measured(name, deblender, batch, band)
+            yield row
+
+
 def main(options):
     threads = on_all_cores()
-    record = records.record(threads)
-    records.print_record(record)
     path = options.catalogue or data_folder() / "catsim_ugrizy.fits"
     if not path.is_file():
         raise BadOption(f"{path} is not there: --catalogue names BlendingToolKit's CatSim sample")
     batch = blends(path, options.blends, options.seed)
     band = batch.survey.available_filters.index(BAND)
-    deblenders = {"SEP": Sep(band)}
-    try:
-        deblenders["scarlet2, true places"] = Scarlet2()
-    except ImportError as error:
-        print(f"without scarlet2: {error}")
-    deblenders["clresample, true places"] = Clresample(detects=False)
-    deblenders["clresample"] = Clresample(detects=True)
-    rows, images = [], {"true": batch.isolated_images[:, :, band]}
-    records.print_head(COLUMNS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of single blends; the table is of all
-        for name, deblender in deblenders.items():
-            row, images[name] = measured(name, deblender, batch, band)
-            rows.append(row)
-            records.print_row(COLUMNS, row)
+    images = {"true": batch.isolated_images[:, :, band]}
+    records.show(COLUMNS, rows_of(batch, band, images), records.record(threads), options.json)
     if options.picture is not None:
         draw(options.picture, batch, band, images)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
 
 
 def parser():
-    parser = Parser("bench.peers", description=__doc__.splitlines()[0])
-    parser.add_argument("--blends", type=positive(int), default=50, metavar="N", help="%(default)s")
-    parser.add_argument("--catalogue", type=Path, metavar="FILE", help="CatSim galaxies")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="of one blend, PNG")
-    parser.add_first_seed(7)
+    parser = Parser(__doc__)
+    parser.add_number("blends", "how many blends", 50)
+    parser.add("catalogue", "CatSim galaxies", type=Path, metavar="FILE")
+    parser.add("picture", "of one blend, PNG", type=Path, metavar="FILE")
+    parser.add_seed(7)
     parser.add_json()
     return parser
 
