@@ -37,7 +37,6 @@ CASES = [
     ("paper.timing", "--folder Makefile", "--folder Makefile"),
     ("real", "--galaxies many", "many"),
     ("real", "--json .", "--json ."),
-    ("real", "--only m87", "--only"),
     ("render", "--sizes 0", "0 is not above 0"),
     ("render", "--sizes 1 --pairs EUCLID-RUBIN", "no observed pixel"),
     ("render", "--quick --sizes 20", "leave --sizes out"),
@@ -61,6 +60,11 @@ def test_bad_options_get_one_line(module, options, words, capsys):
     said = capsys.readouterr().err
     assert ended.value.code == 2
     assert said.count("\n") == 1 and words in said
+
+
+@pytest.mark.usefixtures("data")
+def test_scenes_that_are_not_there_get_one_line(capsys):
+    test_bad_options_get_one_line("real", "--only m87", "--only", capsys)
 
 
 @pytest.mark.parametrize(("module", "options", "words"), [CASES[0], CASES[6]])
