@@ -116,7 +116,9 @@ class OperatorCache:
         with self._lock:
             if private:
                 return operator()
-            return self._operators.find((key, device), operator)
+            shared = self._operators.find((key, device), operator)
+            shared.is_shared = True
+            return shared
 
     @property
     def n_plans(self) -> int:

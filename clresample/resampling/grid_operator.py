@@ -36,6 +36,7 @@ class GridOperator(LinOp):
     Subclasses implement `_prepare` and `_use_shift`, beside `_forward` and `_adjoint`.
     """
 
+    is_shared = False  # True = an OperatorCache returns it to several callers
     _n_geometries = 1
     _mappings: list[Mapping]
     _certificates: list[Certificate]
@@ -127,7 +128,7 @@ class GridOperator(LinOp):
         """Offset (2,) [model px] by which every observed pixel is moved; read-only.
 
         It can be set to one number, (2,), or (n, 2) for n geometries. Raises ValueError for other
-        shapes and for numbers that are not finite.
+        shapes, for numbers that are not finite, and for an OperatorCache's shared operators.
         """
         return self._shift[0] if len(self._shift) == 1 else self._shift
 
@@ -137,6 +138,11 @@ class GridOperator(LinOp):
         if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
             raise ValueError(
                 f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"
+            )
+        if self.is_shared and shift.any():
+            raise ValueError(
+                f"shift is {shift.tolist()}, must be 0 for an operator that others use too: ask the "
+                "cache for one with private=True"
             )
         shift = np.broadcast_to(shift, expected).copy()
         shift.flags.writeable = False  # a change must come through this setter

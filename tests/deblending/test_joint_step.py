@@ -25,7 +25,7 @@ def started(device, *objects, **given):
     blends = [some if isinstance(some, Blend) else blend(some) for some in objects]
     fits = [Fit(b, settings, device, np.dtype(dtype), pad=1) for b in blends]
     start_fits(fits)
-    return loop.LbfgsRun(fits, settings, device, dtype)
+    return loop.LbfgsRun(fits, fits[0].settings, device, dtype)
 
 
 def ended(running):

@@ -156,7 +156,7 @@ def truth(b, device):
         shape=SHARP.shape,
         unpadded_shape=SHARP.shape,
         ops=[
-            cached_resampler(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
+            cached_resampler(b.frame, o.grid, o.psf, dtype=np.float64, device=device, private=True)
             for o in b.observations
         ],
         data=[o.data for o in b.observations],

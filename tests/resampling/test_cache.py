@@ -63,6 +63,8 @@ def test_types_and_private_operators(device):
     mine = make(device, private=True)
     assert mine is not first and mine.plans[0] is first.plans[0]
     mine.shift = (1.0, 0.5)
+    with pytest.raises(ValueError, match="private=True"):
+        first.shift = (1.0, 0.5)
     assert not first.shift.any() and not make(device, private=True).shift.any()
 
 
