@@ -141,8 +141,8 @@ class GridOperator(LinOp):
             )
         if self.is_shared and shift.any():
             raise ValueError(
-                f"shift is {shift.tolist()}, must be 0 for an operator that others use too: ask the "
-                "cache for one with private=True"
+                f"shift is {shift.tolist()}, must be 0 for an operator that others use too: ask "
+                "the cache for one with private=True"
             )
         shift = np.broadcast_to(shift, expected).copy()
         shift.flags.writeable = False  # a change must come through this setter
