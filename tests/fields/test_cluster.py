@@ -10,9 +10,9 @@ import pytest
 from helpers.fields import mosaics_of
 
 from clresample import FieldOptions
-from clresample.fields.execution.backend import TaskKind
+from clresample.device.workers.outcome import Cause
 from clresample.fields.execution.cluster import DaskCluster
-from clresample.fields.execution.reason import Cause
+from clresample.fields.execution.tasks import TaskKind
 from clresample.fields.options import RunProgress
 from clresample.fields.run import run_field
 from clresample.fields.strips import MAX_BYTES, STRIPS
