@@ -8,24 +8,22 @@ Processes are started by "spawn": a script that calls this must put its own stat
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import queue
 import signal
 import threading
-import time
 import traceback
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from multiprocessing import connection
 
 from threadpoolctl import threadpool_limits
 
 from .device import Device, get_device
 from .device_cache import DeviceWarning
 from .discovery import DeviceError, choose, find_devices, n_host_cores
-from .kernel_profiler import report
+from .workers.crew import TaskQueue
+from .workers.outcome import Cause, Reason
+from .workers.pool import WorkerPool
 
 # Items of a device's first portion, before its speed is known.
 FIRST_BATCH = 4
@@ -152,117 +150,76 @@ def distribute(function, items, devices, *, done, most):
     """
     if not devices:
         raise ValueError("device is an empty list, must name at least one")
-    table = _WorkQueue(items, most)
-    workers = [_DeviceProcess(function, choice) for choice in devices]
-    faults: list[str] = []
-    try:
-        while table.open:
-            for worker in workers:
-                if not worker.portion:
-                    portion = table.take(worker, workers)
-                    worker.give(portion, [table.items[i] for i in portion])
-            if not workers:
-                raise DeviceError("; ".join(faults))
-            ready = connection.wait([w.pipe for w in workers if w.portion])
-            for worker in [w for w in workers if w.pipe in ready]:
-                fault = worker.collect(table)
-                if fault:
-                    faults.append(fault)
-                    table.waiting += worker.portion
-                    workers.remove(worker)
-                    worker.stop()
-                    if workers:
-                        left = ", ".join(w.name for w in workers)
-                        warnings.warn(f"{fault}; {left} goes on", DeviceWarning, stacklevel=3)
-            done(table.n_done)
-    except KeyboardInterrupt:
-        for worker in workers:
-            worker.interrupt()
-        for worker in workers:
-            worker.collect(table, patience_s=INTERRUPT_TIMEOUT_S)
-    finally:
-        for worker in workers:
-            worker.stop()
-    return table.results
+    portions = _Portions(items, most)
+    with _DevicePool([_named(choice) for choice in devices]) as pool:
+        job = _compute, [(function, index) for _, index in pool.devices]
+        try:
+            for outcome in pool.outcomes(job, portions):
+                portions.store(outcome)
+                done(portions.n_done)
+        except KeyboardInterrupt:
+            for outcome in pool.interrupted(INTERRUPT_TIMEOUT_S):
+                portions.store(outcome)
+    return portions.results
 
 
-class _WorkQueue:
-    """Waiting items and finished results.
+class _Portions(TaskQueue):
+    """Portions [(index, item), ...] of waiting items, and finished results.
 
-    waiting: indices of items; open: whether any item is not done
+    speeds {worker's number: items/s}: of its last portion; a worker without one is new
     """
 
     def __init__(self, items, most):
-        self.items, self.most, self.waiting = items, most, list(range(len(items)))
-        self.results, self.n_done = [None] * len(items), 0
-
-    @property
-    def open(self):
-        return self.n_done < len(self.items)
+        super().__init__(enumerate(items))
+        self.most, self.speeds = most, {}
+        self.results, self.n_done = [None] * len(self), 0
 
     def take(self, worker, workers):
-        """The next portion for a worker, [index, ...], by its fraction of the total speed."""
-        if worker.speed:
-            known = [w.speed for w in workers if w.speed]
-            total = sum(known) + worker.speed * (len(workers) - len(known))
-            n = max(1, int(BATCH_FRACTION * len(self.waiting) * worker.speed / total))
+        """The next portion for a worker, by its fraction of the total speed."""
+        speed = self.speeds.get(worker.number)
+        if speed:
+            known = [self.speeds[w.number] for w in workers if w.number in self.speeds]
+            total = sum(known) + speed * (len(workers) - len(known))
+            n = max(1, int(BATCH_FRACTION * len(self) * speed / total))
         else:
-            n = min(FIRST_BATCH, -(-len(self.waiting) // len(workers)))
-        n = min(n, self.most)
-        portion, self.waiting = self.waiting[:n], self.waiting[n:]
-        return portion
+            n = min(FIRST_BATCH, -(-len(self) // len(workers)))
+        return [self.waiting.popleft() for _ in range(min(n, self.most, len(self)))]
+
+    def put_back(self, tasks):
+        """Puts the items of portions after all others."""
+        for portion in tasks:
+            self.waiting.extend(portion)
+
+    def store(self, outcome):
+        """Stores the results of a portion that has ended."""
+        for (i, _), result in zip(outcome.task, outcome.value, strict=True):
+            self.results[i] = result
+        self.n_done += len(outcome.task)
+        seconds = max(outcome.end_s - outcome.start_s, 1e-6)
+        self.speeds[outcome.worker] = len(outcome.task) / seconds
 
 
-class _DeviceProcess:
-    """A process with one device.
+class _DevicePool(WorkerPool):
+    """A process for each device, which is lost with its first failure.
 
-    portion: indices of its items; speed [items/s]: of its last portion, None before that
+    devices: name and index of each
     """
 
-    def __init__(self, function, choice):
-        self.name, index = _named(choice)
-        self.portion, self.speed = [], None
-        spawn = multiprocessing.get_context("spawn")
-        self.pipe, other = spawn.Pipe()
-        self.process = spawn.Process(target=_work, args=(function, index, other), daemon=True)
-        self.process.start()
-        other.close()
+    FAULTS, MAX_FAULTS = (Cause.DEVICE, Cause.WORKER), 1
 
-    def give(self, portion, items):
-        """Sends a portion, if there is one; a dead process is detected by `collect`."""
-        self.portion, self._began = portion, time.perf_counter()
-        if portion:
-            with suppress(OSError):
-                self.pipe.send(items)
+    def __init__(self, devices):
+        super().__init__(len(devices), environment={}, setup=_interruptible, reason_of=_failed)
+        self.devices, self.faults = devices, []
 
-    def collect(self, table, patience_s=None):
-        """Receives the process's answer; returns a fault, or None."""
-        if not self.portion:
-            return None
-        try:
-            if patience_s is not None and not self.pipe.poll(patience_s):
-                return f"{self.name} does not answer"
-            results, fault = self.pipe.recv()
-        except (EOFError, OSError):
-            self.process.join(1)
-            return f"the process of {self.name} ended with status {self.process.exitcode}"
-        if fault:
-            return f"{self.name} failed: {fault}"
-        for i, result in zip(self.portion, results, strict=True):
-            table.results[i] = result
-        table.n_done += len(self.portion)
-        self.speed = len(self.portion) / max(time.perf_counter() - self._began, 1e-6)
-        self.portion = []
-        return None
-
-    def interrupt(self):
-        self.process.terminate()
-
-    def stop(self):
-        self.pipe.close()
-        self.process.join(1)
-        if self.process.is_alive():
-            self.process.kill()
+    def drop(self, worker, reason):
+        """Removes a device, with a warning if there are others, otherwise with a DeviceError."""
+        super().drop(worker, reason)
+        self.faults.append(f"{self.devices[worker.number][0]} failed: {reason}")
+        if not self.workers:
+            raise DeviceError("; ".join(self.faults))
+        left = ", ".join(self.devices[w.number][0] for w in self.workers)
+        # the caller's caller of `distribute`
+        warnings.warn(f"{self.faults[-1]}; {left} goes on", DeviceWarning, stacklevel=6)
 
 
 def _named(choice):
@@ -271,22 +228,21 @@ def _named(choice):
     return cl_device.name.strip(), find_devices().index(cl_device)
 
 
-def _work(function, index, pipe):
-    """Runs in a process: items in, results out, until the queue is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C: the parent decides, and terminates
+def _compute(given, portion):
+    """Runs in a device's process: the results of a portion."""
+    function, index = given
+    return function([item for _, item in portion], device=get_device(index))
+
+
+def _failed(error):
+    """The Reason of an exception: whatever it is, the others continue."""
+    return Reason(traceback.format_exception_only(error)[-1].strip(), Cause.DEVICE)
+
+
+def _interruptible():
+    """Makes SIGTERM raise KeyboardInterrupt, so that a portion's results can be returned."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, interrupt)
-    with suppress(EOFError, OSError, KeyboardInterrupt):
-        while True:
-            items = pipe.recv()
-            try:
-                answer = function(items, device=get_device(index)), None
-            except Exception as error:
-                what = traceback.format_exception_only(error)[-1].strip()
-                answer = None, what
-            pipe.send(answer)
-    report()
-    os._exit(0)  # skips the exit handlers of drivers, some of which wait for ever

@@ -18,6 +18,7 @@ from .. import __version__
 from ..deblending.ended import Ended
 from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
+from ..files.tables import table_hdu
 from .columns import finalise_catalogue
 from .execution.group_results import last_rounds
 from .execution.search_setup import read_search_setup
@@ -90,13 +91,8 @@ def _write_catalogues(folder, table):
     if find_spec("pyarrow"):
         write_parquet(folder / "catalogue.parquet", table)
         yield folder / "catalogue.parquet"
-    hdu = fits.table_to_hdu(table)
-    hdu.name = "CATALOGUE"
-    for i, name in enumerate(table.colnames, start=1):
-        text = table[name].info.description
-        if text:  # as the Virtual Observatory's tools read it
-            hdu.header[f"TCOMM{i}"] = text[:68]
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(folder / "catalogue.fits")
+    hdus = [fits.PrimaryHDU(), table_hdu(table, "CATALOGUE")]
+    fits.HDUList(hdus).writeto(folder / "catalogue.fits")
     yield folder / "catalogue.fits"
     yield _write_ecsv(folder / "catalogue.ecsv", table)
 

@@ -43,7 +43,11 @@ def read_catalogue(path) -> QTable:
     except Exception as error:  # a damaged file may provoke any exception in astropy
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{path}: cannot be read as a table ({reason})") from error
-    return _with_text(table)
+    table = _with_text(table)
+    for i, name in enumerate(table.colnames, start=1):
+        if text := table.meta.pop(f"TCOMM{i}", None):
+            table[name].info.description = text
+    return table
 
 
 def write_catalogue(path, table, *, overwrite=False):
@@ -69,12 +73,20 @@ def write_catalogue(path, table, *, overwrite=False):
 
 
 def table_hdu(table, name):
-    """Converts a table to an HDU; characters outside ASCII, which FITS lacks, become "?"."""
+    """Converts a table to an HDU; characters outside ASCII, which FITS lacks, become "?".
+
+    Descriptions of columns become the cards TCOMMn, as tools of the Virtual Observatory read them.
+    """
     check_columns(table.colnames)
+    about = [table[column].info.description for column in table.colnames]
     table = QTable(table, names=[to_ascii(column) for column in table.colnames])
-    table["name"] = [to_ascii(value) for value in table["name"]]
+    if "name" in table.colnames:
+        table["name"] = [to_ascii(value) for value in table["name"]]
     hdu = fits.table_to_hdu(table)
     hdu.name = name
+    for i, text in enumerate(about, start=1):
+        if text:
+            hdu.header[f"TCOMM{i}"] = to_ascii(text)
     return hdu
 
 
@@ -87,7 +99,7 @@ def flag_table_hdu():
 def _with_text(table):
     """Converts bytes of a table to text and fills its masked values."""
     for name in table.colnames:
-        column = table[name]
+        column, about = table[name], table[name].info.description
         kind = getattr(getattr(column, "dtype", None), "kind", "")
         if kind in "SUO":
             plain = np.ma.filled(np.ma.asarray(column), b"" if kind == "S" else "")
@@ -96,4 +108,5 @@ def _with_text(table):
             ]
         elif hasattr(column, "filled"):
             table[name] = column.filled(np.nan if kind == "f" else 0)
+        table[name].info.description = about
     return table

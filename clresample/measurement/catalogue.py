@@ -17,7 +17,7 @@ from ..deblending.posterior.residuals import channel_residuals
 from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import axis_names, celestial_frame, local_axes
-from .columns import Columns
+from .columns import Columns, definition
 from .photometry import add_groups, channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, masked_cores, observation_labels
 from .shapes import moments, shape, shape_slopes
@@ -29,7 +29,7 @@ EDGE_LIGHT = 0.01
 
 # [deg] Scatter of a uniformly distributed angle: the largest possible error.
 UNKNOWN_ANGLE_DEG = 180 / np.sqrt(12)
-SHAPE_UNITS = {"rms_size": u.arcsec, "e1": None, "e2": None, "position_angle": u.deg}
+SHAPES = "rms_size", "e1", "e2", "position_angle"
 
 
 class Flag(IntFlag):
@@ -116,8 +116,14 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
             `is_ambiguous`; -1 if there is none
     """
     table = catalogue_columns(result, magnitudes=magnitudes, groups=groups).table()
-    table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
+    describe_flags(table)
     return table
+
+
+def describe_flags(table):
+    """Adds the names of all flags to the description of a table's column `flags`."""
+    names = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
+    table["flags"].info.description = f"{definition('flags').description}: {names}"
 
 
 def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
@@ -193,7 +199,7 @@ def add_positions(table, grid, positions, suffix):
     for name, values in zip(names, sky, strict=True):
         table.put(name + suffix, values, unit)
     for name, values in zip("yx", positions.T, strict=True):
-        table.put(name + suffix, values, u.pix)
+        table.put(name + suffix, values)
 
 
 def _add_shapes(table, result, error):
@@ -222,9 +228,9 @@ def _add_shapes(table, result, error):
     add_positions(table, result.frame.grid, centroids, "_centroid")
     _add_position_errors(table, result, centroids)
     shape_errors[:, 3] = np.minimum(shape_errors[:, 3], UNKNOWN_ANGLE_DEG)
-    for i, (name, unit) in enumerate(SHAPE_UNITS.items()):
-        table.put(name, sizes[:, i], unit)
-        table.put(f"{name}_err", shape_errors[:, i], unit)
+    for i, name in enumerate(SHAPES):
+        table.put(name, sizes[:, i])
+        table.put(f"{name}_err", shape_errors[:, i])
 
 
 def _released(centroid, second, moved):
@@ -263,13 +269,13 @@ def _add_position_errors(table, result, centroids):
     for i, name in enumerate(names):
         table.put(f"{name}_centroid_err", on_sky[:, i], unit)
     for i, name in enumerate("yx"):
-        table.put(f"{name}_centroid_err", errors[:, i], u.pix)
+        table.put(f"{name}_centroid_err", errors[:, i])
 
 
 def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     flux_ujy = np.where(flux_ujy > 0, flux_ujy, np.nan)
-    table.put(f"mag_{channel}", ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy), u.mag)
-    table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy, u.mag)
+    table.put(f"mag_{channel}", ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy))
+    table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy)
 
 
 def _add_colours(table, result, flux, bands):
@@ -283,8 +289,8 @@ def _add_colours(table, result, flux, bands):
         slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
         both = covariance[:, pair][:, :, pair]
         error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
-        table.put(f"colour_{a}_{b}", table[f"mag_{a}"] - table[f"mag_{b}"], u.mag)
-        table.put(f"colour_err_{a}_{b}", 2.5 / np.log(10) * error, u.mag)
+        table.put(f"colour_{a}_{b}", table[f"mag_{a}"] - table[f"mag_{b}"])
+        table.put(f"colour_err_{a}_{b}", 2.5 / np.log(10) * error)
 
 
 def _flags(result, flux, error, positions, footprints):

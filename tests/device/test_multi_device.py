@@ -13,13 +13,14 @@ from clresample.deblending import batch
 from clresample.device import multi_device
 from clresample.device.device_cache import DeviceWarning
 from clresample.device.multi_device import (
-    _WorkQueue,
+    _Portions,
     distribute,
     iterate_threads,
     map_threads,
     one_blas_thread,
     prefetch,
 )
+from clresample.device.workers.crew import Worker
 
 
 def blas_threads():
@@ -81,9 +82,9 @@ def test_an_error_is_raised_by_name_when_nobody_is_left(device):
 
 def test_what_a_dead_process_had_is_done_by_the_others(device, tmp_path):
     items = [(str(tmp_path), n) for n in range(12)]
-    with pytest.warns(DeviceWarning, match="ended with status 3; .* goes on"):
+    with pytest.warns(DeviceWarning, match="ended with exit status 3; .* goes on") as caught:
         results, _ = dealt(first_dies, items, [device, device])
-    assert results == list(range(12))
+    assert results == list(range(12)) and caught[0].filename == __file__
 
 
 def test_without_items_or_devices(device):
@@ -104,32 +105,31 @@ def test_ctrl_c_keeps_what_was_done(device):
     assert results[8:] == [None] * 32
 
 
-class Known:
-    """A worker of known speed."""
-
-    def __init__(self, speed):
-        self.speed = speed
+def portions(n_items, most, speeds):
+    table = _Portions(range(n_items), most)
+    table.speeds = speeds
+    return table
 
 
 def test_portions_follow_the_speeds():
-    quick, slower, new = Known(90.0), Known(10.0), Known(None)
-    table = _WorkQueue(range(200), 1000)
+    quick, slower, new = Worker(0), Worker(1), Worker(2)
+    table = portions(200, 1000, {0: 90.0, 1: 10.0})
     assert len(table.take(quick, [quick, slower])) == 90
     assert len(table.take(slower, [quick, slower])) == 5
     assert len(table.take(new, [quick, slower, new])) == 4
-    assert len(_WorkQueue(range(200), 7).take(quick, [quick, slower])) == 7
-    last = _WorkQueue(range(1), 7)
-    assert last.take(slower, [quick, slower]) == [0] and last.waiting == []
+    assert len(portions(200, 7, {0: 90.0, 1: 10.0}).take(quick, [quick, slower])) == 7
+    last = portions(1, 7, {0: 90.0, 1: 10.0})
+    assert last.take(slower, [quick, slower]) == [(0, 0)] and not last
     assert last.take(quick, [quick, slower]) == []
 
 
 def test_portions_of_all_sizes_are_each_taken_once():
-    table, workers = _WorkQueue(range(50), 9), [Known(3.0), Known(1.0)]
+    table, workers = portions(50, 9, {0: 3.0, 1: 1.0}), [Worker(0), Worker(1)]
     taken = []
-    while table.waiting:
+    while table:
         for worker in workers:
             taken += table.take(worker, workers)
-    assert sorted(taken) == list(range(50))
+    assert sorted(taken) == [(i, i) for i in range(50)]
 
 
 def test_ahead_gives_the_items_in_order_and_at_most_two_beside_the_one_in_use():
@@ -197,14 +197,12 @@ def test_the_host_has_as_many_threads_as_its_processor_may_use(monkeypatch):
     cpu = SimpleNamespace(kind="CPU", compute_units=3)
     gpu = SimpleNamespace(kind="GPU", compute_units=100)
     monkeypatch.setattr(multi_device, "MAX_THREADS", 6)
-    monkeypatch.setattr(
-        multi_device.os, "sched_getaffinity", lambda _: set(range(5)), raising=False
-    )
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(5)), raising=False)
     assert multi_device.host_threads(cpu) == 3 and multi_device.host_threads(gpu) == 5
     cpu.compute_units = 64
     assert multi_device.host_threads(cpu) == 5
-    monkeypatch.delattr(multi_device.os, "sched_getaffinity")
-    monkeypatch.setattr(multi_device.os, "cpu_count", lambda: 9)
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 9)
     assert multi_device.host_threads(cpu) == multi_device.host_threads(gpu) == 6
 
 

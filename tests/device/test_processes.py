@@ -22,23 +22,31 @@ ways = {
     "operator": lambda: op(x), "new": make, "memory": lambda: device.put(x), "wait": device.finish,
     "device": get_device, "given": lambda: get_device(device),
 }
-if os.fork() == 0:
-    signal.alarm(30)
-    try:
-        ways[sys.argv[1]]()
-    except Exception as error:
-        print(type(error).__name__, error, flush=True)
-    os._exit(0)
-os.wait()
-print("parent", np.array_equal(op(x), before))
+for way, call in ways.items():
+    if os.fork() == 0:
+        signal.alarm(30)
+        try:
+            call()
+        except Exception as error:
+            print(way, type(error).__name__, error, flush=True)
+        os._exit(0)
+    os.wait()
+    print(way, "parent", np.array_equal(op(x), before), flush=True)
 """
+
+
+@pytest.fixture(scope="module")
+def forked():
+    """{way: lines} of what a process says that forks once for each way to use the device."""
+    lines = run_python("-c", SET_UP + FORKED).stdout.splitlines()
+    words = [line.partition(" ") for line in lines]
+    return {way: [text for key, _, text in words if key == way] for way, _, _ in words}
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes are forked here")
 @pytest.mark.parametrize("way", ["operator", "new", "device", "given", "memory", "wait"])
-def test_a_forked_process_is_told_so(way):
-    answer = run_python("-c", SET_UP + FORKED, way)
-    child, parent = answer.stdout.splitlines()
+def test_a_forked_process_is_told_so(forked, way):
+    child, parent = forked[way]
     assert child.startswith("DeviceError ") and "before this process was forked" in child
     assert "spawn" in child
     assert parent == "parent True"
@@ -51,6 +59,14 @@ def test_a_process_forked_before_is_fine():
     assert answer.stdout == "(9, 9)\n"
 
 
+@pytest.fixture(scope="module")
+def pocl():
+    """Skips where the CPU's OpenCL is another."""
+    platform = run_python("-c", "from clresample import *; print(get_device().platform)")
+    if "Portable Computing" not in platform.stdout:
+        pytest.skip("the CPU's OpenCL is not PoCL")
+
+
 @pytest.mark.parametrize(
     "variables, said",
     [
@@ -60,12 +76,9 @@ def test_a_process_forked_before_is_fine():
         ({"POCL_DEVICES": "nonsense"}, "PoCL shows no device for POCL_DEVICES=nonsense"),
     ],
 )
-def test_a_cache_that_cannot_be_written_is_said(tmp_path, monkeypatch, variables, said):
+def test_a_cache_that_cannot_be_written_is_said(pocl, tmp_path, monkeypatch, variables, said):
     file = tmp_path / "file"
     file.write_text("")
-    platform = run_python("-c", "from clresample import *; print(get_device().platform)")
-    if "Portable Computing" not in platform.stdout:
-        pytest.skip("the CPU's OpenCL is not PoCL")
     for name, value in variables.items():
         monkeypatch.setenv(name, value.replace("{file}", str(file)))
     answer = run_python(

@@ -170,38 +170,42 @@ def test_tiles_leave_no_seams(done, sky, tmp_path, tile_px, n_tiles):
     assert np.abs(differences).max() == 0
 
 
-def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, sky, tmp_path):
-    folder, _ = done
-    rows = table(folder)
-    largest = int(rows["n_blend_sources"].max())
-    assert largest >= 3
-    options = FieldOptions(limits=FitLimits(max_sources=largest - 1))
-    run_field(mosaics_of(sky), tmp_path, options=options)
-    cut = table(tmp_path)
-    assert set(cut["status"]) == {"converged"}
-    where = cut["n_blend_sources"] == largest
-    reasons = {str(reason) for reason in cut["reason"][where]}
-    assert all("pieces" in reason for reason in reasons) and reasons
-    rounds = table(tmp_path, "fit_table")["n_refits"]
-    assert rounds.min() == 0 and rounds.max() >= 1
-    differences, n_others = compared(folder, tmp_path)
-    assert n_others == 0 and np.median(np.abs(differences)) < 0.5
-
-
-def test_later_rounds_keep_the_number_of_components(done, sky, tmp_path, monkeypatch):
-    """That an earlier one found; the first leaves it to the data."""
-    folder, _ = done
-    limits = FitLimits(max_sources=int(table(folder)["n_blend_sources"].max()) - 1)
-    given, blend_of = [], fitting.make_blend
+@pytest.fixture(scope="module")
+def cut(done, sky, tmp_path_factory):
+    """The folder of a run whose largest blends are cut; and of each blend that was fitted whether
+    it was a later round's, and the numbers of components that it was given."""
+    largest = int(table(done[0])["n_blend_sources"].max())
+    options, folder = FieldOptions(limits=FitLimits(max_sources=largest - 1)), tmp_path_factory
+    folder, given, blend_of = folder.mktemp("cut"), [], fitting.make_blend
 
     def noted(patch, *others):
         blend, boxes = blend_of(patch, *others)
         given.append((others[-2] is not None, [s.n_components for s in blend.sources]))
         return blend, boxes
 
-    monkeypatch.setattr(fitting, "make_blend", noted)
-    run_field(mosaics_of(sky), tmp_path, options=FieldOptions(limits=limits, passes=1))
-    first, later = ([n for is_later, ns in given if is_later == k for n in ns] for k in (0, 1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "make_blend", noted)
+        run_field(mosaics_of(sky), folder, options=options)
+    return folder, given
+
+
+def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, cut):
+    rows = table(cut[0])
+    largest = int(table(done[0])["n_blend_sources"].max())
+    assert largest >= 3
+    assert set(rows["status"]) == {"converged"}
+    where = rows["n_blend_sources"] == largest
+    reasons = {str(reason) for reason in rows["reason"][where]}
+    assert all("pieces" in reason for reason in reasons) and reasons
+    rounds = table(cut[0], "fit_table")["n_refits"]
+    assert rounds.min() == 0 and rounds.max() >= 1
+    differences, n_others = compared(done[0], cut[0])
+    assert n_others == 0 and np.median(np.abs(differences)) < 0.5
+
+
+def test_later_rounds_keep_the_number_of_components(cut):
+    """That an earlier one found; the first leaves it to the data."""
+    first, later = ([n for is_later, ns in cut[1] if is_later == k for n in ns] for k in (0, 1))
     assert set(first) == {None} and later and None not in later
 
 

@@ -220,6 +220,7 @@ def test_columns_have_units():
     plain = {"snr", "n_components", "chi2_raw", "chi2_cam", "e1", "e2", "e1_err", "e2_err"}
     plain |= {f"max_residual_{name}" for name in "abgri"}
     plain |= {"misfit_sigma", "misfit_fraction", "ambiguous_with"}
+    assert all(table[name].info.description for name in table.colnames)
     assert set(units) == plain
     assert all(units[name] in (None, u.dimensionless_unscaled) for name in plain)
     magnitudes = 25 - 2.5 * np.log10(table["flux_g"].value / 10 ** ((23.9 - 25) / 2.5))

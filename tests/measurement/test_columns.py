@@ -1,10 +1,11 @@
 """Columns of tables that are not tables yet."""
 
 import numpy as np
+import pytest
 from astropy import units as u
 from astropy.table import QTable
 
-from clresample.measurement.columns import Columns
+from clresample.measurement.columns import Columns, definition
 
 
 def columns(n, first, names, meta):
@@ -47,3 +48,21 @@ def test_rows_are_chosen_and_become_a_table():
     for name in table.colnames:
         assert (table[name] == expected[name]).all() and table[name].dtype == expected[name].dtype
     assert table["a"].unit == u.uJy
+
+
+@pytest.mark.parametrize(
+    "name, description, unit",
+    [
+        ("y", "row of the position in the model's pixels, from 0", u.pix),
+        ("mag_err_r", "error of the magnitude in r", u.mag),
+        ("flux_r_err", "total flux in r_err", None),
+        ("rms_size_err", "error of rms_size", u.arcsec),
+        ("ra_centroid_err", "error of ra_centroid", u.deg),
+        ("other", "", None),
+    ],
+)
+def test_columns_are_defined_by_names_beginnings_and_ends(name, description, unit):
+    assert definition(name)[:2] == (description, unit)
+    found = Columns.without_rows([name])
+    assert len(found) == 0 and found.units == ({} if unit is None else {name: unit})
+    assert (found.table()[name].info.description or "") == description

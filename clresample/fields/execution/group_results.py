@@ -11,27 +11,28 @@ from astropy import units as u
 from astropy.io import fits
 
 from ...files.fits import open_fits
-from ...measurement.columns import Columns
+from ...measurement.columns import DEFINITIONS, Columns, definitions
 from ...sky.box import Box
 
-PATCH_COLUMNS: dict[str, type | str] = {
-    "fit_id": np.int64,
-    "parent_id": np.int64,
-    "n_refits": np.int64,
-    "status": "U",
-    "n_sources": np.int64,
-    "n_pixels": np.int64,
-    "n_iterations": np.int64,
-    "seconds": float,
-}
+# Columns of patches, also of fit_table.ecsv.
+PATCH_COLUMNS = definitions(
+    {
+        "fit_id": ("number of the fit", None, np.int64),
+        "parent_id": ("id of the brightest source detected in the blend", None, np.int64),
+        "n_refits": ("how often a piece of a cut blend was fitted again", None, np.int64),
+        "status": ("how the fit ended", None, "U"),
+        "n_sources": ("that were fitted together", None, np.int64),
+        "n_pixels": ("of the model, about the blend", None, np.int64),
+        "n_iterations": ("of the fit", None, np.int64),
+        "seconds": ("of the fit, its share of a group's", u.s),
+    }
+)
 META = "FRAME", "EXTNAME"  # cards of a table's header that enter its Columns too
 FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
-FOUND_COLUMNS: dict[str, type] = {
-    "fit_id": np.int64,
-    "id": np.int64,
-    "y": float,
-    "x": float,
-    "host": np.int64,
+FOUND_COLUMNS = {
+    "fit_id": PATCH_COLUMNS["fit_id"],
+    **{name: DEFINITIONS[name] for name in ("id", "y", "x")},
+    "host": DEFINITIONS["group_id"],
 }
 COMPONENT_COLUMNS = ("id", "parent_id", "fit_id", "y0", "x0", "n_y", "n_x", "offset")
 MODEL_COLUMNS = ("fit_id", "mosaic", "y0", "x0", "y1", "x1", "offset")
@@ -87,8 +88,8 @@ class GroupResults:
         hdus = [
             fits.PrimaryHDU(),
             _table(Columns.concatenate([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
-            _table(_typed(self.patches, PATCH_COLUMNS), "PATCHES"),
-            _table(_typed(self.found, FOUND_COLUMNS), "FOUND"),
+            _table(typed_rows(self.patches, PATCH_COLUMNS), "PATCHES"),
+            _table(typed_rows(self.found, FOUND_COLUMNS), "FOUND"),
             _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
             _floats(self.spectra, "SPECTRA"),
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
@@ -101,11 +102,12 @@ class GroupResults:
         return file.getvalue()
 
 
-def _typed(rows, kinds):
-    """The Columns of rows; kinds: {name: type}."""
-    columns = zip(*rows, strict=True) if rows else [()] * len(kinds)
-    pairs = zip(kinds.items(), columns, strict=True)
-    return Columns({name: np.array(values, kind) for (name, kind), values in pairs})
+def typed_rows(rows, kinds):
+    """The Columns of rows; kinds {name: ColumnDefinition}."""
+    columns, found = zip(*rows, strict=True) if rows else [()] * len(kinds), Columns()
+    for (name, kind), values in zip(kinds.items(), columns, strict=True):
+        found.put(name, np.array(values, kind.dtype), kind.unit)
+    return found
 
 
 def _whole(rows, names):

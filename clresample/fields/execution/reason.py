@@ -1,57 +1,14 @@
-"""Reasons for which tasks have no value."""
+"""Reasons of a field's tasks that have no value."""
 
 from __future__ import annotations
 
-import enum
-import errno
-import traceback
-from dataclasses import dataclass
+from dataclasses import replace
 
-from ...device.discovery import DeviceError
+from ...device.workers.outcome import Cause, Reason
 from ...files.atomic import WriteError
 
 
-class Cause(enum.Enum):
-    """Kind of a reason, by which a run decides what follows.
-
-    TASK: an error of the task itself; WORKER: its worker ended or hung
-    DEVICE: an error of the worker's device; DISK: a file cannot be written, as on a full disk
-    PACKAGE: a package is not installed
-    """
-
-    TASK = enum.auto()
-    WORKER = enum.auto()
-    DEVICE = enum.auto()
-    DISK = enum.auto()
-    PACKAGE = enum.auto()
-
-
-@dataclass(frozen=True)
-class Reason:
-    """Reason for which a task has no value; its text is one line.
-
-    message: without the kind of error; cause: Cause; kind: name of the exception's class
-    """
-
-    message: str
-    cause: Cause
-    kind: str = ""
-
-    def __str__(self):
-        return f"{self.kind}: {self.message}" if self.kind else self.message
-
-    @classmethod
-    def of(cls, error) -> Reason:
-        """The reason of an exception, with the place where it was raised."""
-        text = " ".join(str(error).split()) or "no message"
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        message = f"{text} ({last.name}, line {last.lineno})"
-        return cls(message, _cause(error), type(error).__name__)
-
-
-def _cause(error):
-    if isinstance(error, DeviceError):
-        return Cause.DEVICE
-    if isinstance(error, WriteError) or getattr(error, "errno", None) == errno.ENOSPC:
-        return Cause.DISK
-    return Cause.PACKAGE if isinstance(error, ImportError) else Cause.TASK
+def reason_of(error) -> Reason:
+    """The reason of an exception; a file that cannot be written is a matter of its disk."""
+    reason = Reason.of(error)
+    return replace(reason, cause=Cause.DISK) if isinstance(error, WriteError) else reason

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...device.workers.outcome import Cause
 from ...files.atomic import FileError
-from .backend import TaskKind
 from .fitting import fit_group, is_large, mark_failed
 from .group_inputs import FitGroup, gather_inputs
 from .group_results import FOUND_COLUMNS, GroupResultsFile
-from .reason import Cause
+from .tasks import TaskKind
 
 # Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
 # light subtracted. Crowded pieces settle in the third or fourth round.

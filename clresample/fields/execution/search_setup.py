@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from ...device.device import get_device
+from ...device.workers.outcome import Cause
 from ...files.atomic import FileError
 from ...sky.grid import Grid
 from ..blends.search import snr_scatter
-from .backend import TaskKind
-from .reason import Cause
+from .tasks import TaskKind
 
 # Largest fraction of a device's memory that a group of fits may take by prediction: predictions are
 # rough, and the driver, its kernels and the next group's data need memory too.

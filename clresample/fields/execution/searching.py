@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ...device.workers.outcome import Cause
 from ...files.atomic import atomic_file
 from ...sky.grid import Grid
 from ..blends.link import link_footprints
 from ..blends.plan import FitPlan, make_fit_plan
 from ..blends.search import TileDetections, grown_footprints, place_known_sources, search_tile
 from ..blends.tiles import tiles_of
-from .backend import TaskKind
-from .reason import Cause
 from .search_setup import read_search_setup
+from .tasks import TaskKind
 
 # [bytes] Memory of a search per model pixel and channel; the total has two channels more. Measured:
 # 132, 268 and 536 bytes a pixel for 1, 4 and 8 channels in the model's own pixels.

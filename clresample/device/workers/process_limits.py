@@ -56,21 +56,6 @@ def trim_memory():
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def freeze_objects():
-    """Excludes all objects that exist now (modules, kernels, context) from garbage collection.
-
-    Called by a worker after the first task of a stage: a collection then takes 1 ms instead of 70.
-    Cycles among the excluded objects are freed after `unfreeze_objects`, at the start of the next
-    stage.
-    """
-    gc.freeze()
-
-
-def unfreeze_objects():
-    """Includes all objects in garbage collection again."""
-    gc.unfreeze()
-
-
 def die_with_parent(parent):
     """Makes the system end this process when its parent is killed, if it can (Linux).
 
