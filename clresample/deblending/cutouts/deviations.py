@@ -97,7 +97,7 @@ def _frame_part(result, i_observation, window):
 
 
 def _of_fluxes(result, chosen, i_observation, window):
-    """Computes the deviations from covariances of fluxes, or without Errors from those of spectra."""
+    """Computes the deviations from covariances of fluxes; without Errors, of spectra."""
     channels = result.channel_slices()[i_observation]
     n_y, n_x = (part.stop - part.start for part in window)
     units, owners, covariance = [], [], []
