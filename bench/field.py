@@ -62,7 +62,7 @@ COLUMNS = records.columns(
 
 
 def compared(fields, channels):
-    """What several fields' catalogues are beside their truth.
+    """Figures of several fields' catalogues compared with their truth.
 
     fields: of (table, truth, n_model); channels: names
     """

@@ -1,4 +1,4 @@
-"""How a field's time, memory and own cost go with workers, and with one giant blend.
+"""Time, memory and own cost of a field against the number of workers, and of one giant blend.
 
     python -m bench.scaling [--quick] [--json FILE]
     python -m bench.scaling --giant 1500 --sizes 3000 --workers 2
@@ -162,7 +162,7 @@ def tail_of(turns, workers):
 
 
 def rows_of(size, options, bands):
-    """Yield the rows of one field, with each number of workers, as often as asked."""
+    """Yields the rows of one field, with each number of workers, as often as asked."""
     usual = 1 if options.quick or options.giant else REPEATS
     with tempfile.TemporaryDirectory() as folder:
         toml, own = written(Path(folder) / "sky", size, options, bands)

@@ -56,7 +56,7 @@ def _devices():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem):
-    """Skip a test that asks a device for float64 which it does not have."""
+    """Skips a test that asks a device for float64 which it does not have."""
     try:
         return (yield)
     except DeviceError as error:

@@ -14,12 +14,20 @@ import clresample
 MAX_FIRST_LINE = 93
 MADE_ELSEWHERE = {"Device"}  # by `get_device`: users call no constructor
 QUESTION = re.compile(r"(What|Who|Where|Which|How|Whether)\b")
-FILES = sorted((ROOT / "clresample").rglob("*.py"))
 PUBLIC = [
     name for name in sorted(clresample.__all__)
     if name not in MADE_ELSEWHERE and callable(getattr(clresample, name))
 ]  # fmt: skip
-TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in FILES}
+
+
+def trees_of(folder):
+    """{path: syntax tree} of the Python files in a folder of the checkout."""
+    paths = sorted((ROOT / folder).rglob("*.py"))
+    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in paths}
+
+
+TREES = trees_of("clresample")
+ALL_TREES = TREES | trees_of("bench") | trees_of("tools")
 
 
 def faults_of(docstring):
@@ -41,9 +49,9 @@ def documented(tree):
                 yield getattr(node, "name", "the module"), docstring
 
 
-@pytest.mark.parametrize("path", TREES)
+@pytest.mark.parametrize("path", ALL_TREES)
 def test_first_lines_are_one_sentence_on_one_line(path):
-    found = {name: faults_of(text) for name, text in documented(TREES[path])}
+    found = {name: faults_of(text) for name, text in documented(ALL_TREES[path])}
     assert {name: faults for name, faults in found.items() if faults} == {}
 
 

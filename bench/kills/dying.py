@@ -20,7 +20,7 @@ PATH_OF |= {"os.rename": 1, "os.link": 1}  # which of an event's values is the p
 
 
 def watch(log, folder, moment, n_bytes):
-    """Count moments from now on, in Python's audit events; die at the given one."""
+    """Counts moments from now on, in Python's audit events; dies at the given one."""
     seen, inside = 0, os.path.join(os.path.realpath(folder), "")
     lines = open(log, "a", buffering=1)  # noqa: SIM115 - open until the process ends
 

@@ -123,7 +123,7 @@ def sample_of(options):
 
 
 def main():
-    """Run the sample; the exit status says whether all mutations were killed."""
+    """Runs the sample; the exit status says whether all mutations were killed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

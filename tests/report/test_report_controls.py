@@ -70,7 +70,7 @@ def browser(shared, page):
 
 
 def choose(browser, name, value):
-    """Choose in a list, or write into a field."""
+    """Chooses in a list, or writes into a field."""
     browser.value(
         f"(() => {{ const e = byId('{name}'); e.value = '{value}';"
         "for (const kind of ['input', 'change'])"

@@ -24,7 +24,7 @@ from clresample.testing import check_adjoint
 
 @pytest.fixture
 def builds(device, monkeypatch):
-    """Run a function of the device with each build that it takes, watching all buffers."""
+    """Runs a function of the device with each build that it takes, watching all buffers."""
     kinds = ("CPU", "GPU") if device.kind == "CPU" else (device.kind,)
 
     def run(check):
