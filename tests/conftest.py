@@ -92,7 +92,7 @@ def device(request):
 
 @pytest.fixture(scope="session", autouse=True)
 def as_asked(request):
-    """What the options ask of all devices; the Guards, where asked for."""
+    """Applies the options to all devices; yields the Guards, if they were requested."""
     with pytest.MonkeyPatch.context() as patch:
         if request.config.getoption("--as-gpu"):
             opened = Device.__init__

@@ -31,7 +31,7 @@ ALL_TREES = TREES | trees_of("bench") | trees_of("tools")
 
 
 def faults_of(docstring):
-    """What is wrong with the first line of a docstring, a word each."""
+    """Faults of the first line of a docstring, a word each."""
     first, *rest = docstring.split("\n")
     return [
         *(["a question"] if QUESTION.match(first) else []),
@@ -53,6 +53,16 @@ def documented(tree):
 def test_first_lines_are_one_sentence_on_one_line(path):
     found = {name: faults_of(text) for name, text in documented(ALL_TREES[path])}
     assert {name: faults for name, faults in found.items() if faults} == {}
+
+
+def test_first_lines_of_tests_are_no_questions():
+    found = [
+        (path, name)
+        for path, tree in trees_of("tests").items()
+        for name, text in documented(tree)
+        if "a question" in faults_of(text)
+    ]
+    assert found == []
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_boxes_end_where_light_does(profile, at, first, end, centre):
 
 
 def test_boxes_of_a_start_hold_five_pixels_about_small_sources():
-    """Where its light ends before; as far as the frame goes."""
+    """To the end of its light if that is nearer, and inside the frame."""
     for place, wanted in (((25, 30), [20, 25, 31, 36]), ((3, 57), [0, 52, 9, 60])):
         image = _spot((50, 60), place, 0.4)
         low, size, centre, part = component_box(point_of(image[None], place), 0, (50, 60), 1.0)
@@ -140,7 +140,7 @@ def test_active_sources_are_those_there_are(device, which):
 
 
 def test_variances_are_at_least_those_with_all_else_known():
-    """Where rounding says otherwise; of what is not seen they are infinite."""
+    """Even if rounding lowers them; of unobserved spectra they are infinite."""
     near = np.array([[1.0, 1 - 1e-17, 0], [1 - 1e-17, 1.0, 0], [0, 0, 0]])
     for unit in (1.0, 1e-6, 1e6):
         found = spectrum_covariance(unit * near[None])[0]

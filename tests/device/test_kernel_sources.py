@@ -1,4 +1,4 @@
-"""What every kernel source keeps to, so that it builds anywhere and can be read alone."""
+"""Rules of all kernel sources: each builds on any device and can be read alone."""
 
 import re
 

@@ -78,7 +78,7 @@ def test_again_replaces_a_failed_task(tmp_path):
 
 
 def whose(folder, task):
-    """Which process has it."""
+    """Number of the process that has it."""
     return os.getpid()
 
 
@@ -139,7 +139,7 @@ class Itself:
 
 
 class Shared(Itself):
-    """What the tasks of a stage share; a process knows those that are there."""
+    """Context that the tasks of a stage share; a process holds those present."""
 
     there: ClassVar = weakref.WeakSet()
 
@@ -152,7 +152,7 @@ class Shared(Itself):
 
 
 def shared_there(shared, task):
-    """How many contexts of this and earlier stages the worker holds."""
+    """Number of contexts of this and earlier stages that the worker holds."""
     return len(Shared.there)
 
 

@@ -168,7 +168,7 @@ class Browser:
         self.until("document.readyState === 'complete' && location.protocol === 'file:'")
 
     def value(self, expression):
-        """What an expression is in the page, or what its promise gives."""
+        """Value of an expression in the page, or of its promise."""
         how = {"returnByValue": True, "awaitPromise": True}
         answer = self.ask("Runtime.evaluate", expression=expression, **how)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]

@@ -1,4 +1,4 @@
-"""Which tests may notice a mutation, the likeliest and quickest first.
+"""Selects tests that may notice a mutation, the likeliest and quickest first.
 
 What each test runs is recorded once (record.py) and kept in .mutants/ until the package, the tests'
 helpers or the test's own file change.
@@ -33,7 +33,7 @@ def test_files(path):
 
 
 class Covering:
-    """What the tests of some files run.
+    """Lines of code that the tests of some files run.
 
     serve: a function that takes a request of serve.py and returns its answer
     folder: the copy of the checkout in which they ran

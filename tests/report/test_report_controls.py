@@ -85,7 +85,7 @@ def text(browser, name):
 
 
 def saved(browser, button):
-    """What a button saves."""
+    """File that a button saves."""
     browser.value(f"delete {ROOT}.saved")
     browser.value(f"{button}.click()")
     path = browser.saved / browser.until(f"{ROOT}.saved")
