@@ -8,8 +8,8 @@ belongs to the galaxy) or in all bins together, from 3 on; a bin without an uppe
 snr_high = null in the JSON:
 
 mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric galaxies on mosaics
-            of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
-            "-as-white": it is not told
+            of pixels of 0.7, whose noise is correlated; with "-as-white" the fit assumes white
+            noise, otherwise it estimates the correlation
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly
             negative; real: sizes, arms, clumps and ellipticals of a real sky, where asked for
 light       drawn: magnitudes uniform in 20 - 29, those of all COSMOS galaxies; even: all light of a

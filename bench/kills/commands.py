@@ -2,7 +2,7 @@
 
 Each command is run undisturbed, into an empty place and over files that are there (--overwrite);
 then killed so many times in each way, spread over all that it does in its folder, see dying.py:
-with SIGKILL as it opens, moves, links or removes something, and by turns in the midst of a file.
+with SIGKILL as it opens, moves, links or removes something, and by turns inside a file.
 
 command    what was run; over: over files that were there
 moment     what it was about to do, or how many bytes of which file were written

@@ -1,4 +1,4 @@
-"""`clresample` that ends in the midst of its writing, at a moment that is told beforehand.
+"""`clresample` that ends during its writing, at a moment that is chosen beforehand.
 
     python -m bench.kills.dying LOG FOLDER MOMENT N_BYTES COMMAND ...
 
