@@ -29,7 +29,7 @@ from clresample import Device, DeviceError, get_device, list_devices
 # Shells start what runs in the background with Ctrl-C ignored, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-pytest_plugins = ("helpers.builds", "helpers.field_run")  # fixtures of several rooms
+pytest_plugins = ("helpers.builds", "helpers.field_run")  # fixtures of several folders
 NO_DOUBLE = "has no double precision: use float32"
 
 

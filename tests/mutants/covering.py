@@ -20,15 +20,15 @@ def test_files(path):
     """The test files, relative to the checkout, that may notice a change of a file or folder."""
     parts = path.relative_to(ROOT).parts
     if parts[0] == "kernels":
-        rooms = ["device", "resampling", "deblending", "paper", "measurement"]
+        packages = ["device", "resampling", "deblending", "paper", "measurement"]
     elif len(parts) > 2 or path.is_dir():
-        rooms = {"deblending": ["deblending", "measurement", "paper"]}.get(parts[1], [parts[1]])
+        packages = {"deblending": ["deblending", "measurement", "paper"]}.get(parts[1], [parts[1]])
     else:
-        rooms = ["resampling", "deblending"]
+        packages = ["resampling", "deblending"]
     return sorted(
         str(file.relative_to(ROOT))
-        for room in rooms
-        for file in (ROOT / "tests" / room).glob("test_*.py")
+        for package in packages
+        for file in (ROOT / "tests" / package).glob("test_*.py")
     )
 
 
