@@ -2,10 +2,10 @@
 
     python -m tests.mutants PATH [--n 20] [--seed 0] [--lines 10,12] [--tests FILE ...]
 
-PATH is a file or a folder of the package or of kernels/. Each mutation changes one token, as a typing
-error would: a sign, a comparison, a factor, a number, min for max. The tests of the module's package
-that run the changed line are run on a copy of the checkout, the quickest first, until one fails. A
-mutation that runs too long counts as killed; one that does not compile is not counted.
+PATH is a file or a folder of the package or of kernels/. Each mutation changes one token as a
+typing error would: a sign, a comparison, a factor, a number, min for max. Tests of the module's
+package that run the changed line are tried on a copy of the checkout, the quickest first, until one
+fails. A mutation that runs too long counts as killed; one that does not compile is not counted.
 equivalent.toml lists mutations that no test can detect. The exit status is 0 if all others were
 killed.
 """
