@@ -138,3 +138,38 @@ def test_public_parameters_with_a_unit_in_their_name_have_it_or_are_named_in_ful
         given = re.search(rf"\b{parameter}\b(?: \([^)]*\))? \[([^\]]*)\]", text)
         if unit and given:
             assert unit in given[1].replace("pixel", "px"), (parameter, given[1])
+
+
+def members(node):
+    """Names in a class: methods, arguments, fields, and attributes that it sets."""
+    for inner in ast.walk(node):
+        match inner:
+            case ast.FunctionDef(name=name) | ast.arg(arg=name) | ast.Name(id=name):
+                yield name
+            case ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name
+
+
+def all_members():
+    """{class of the package: its members and those of its bases}, but for foreign bases."""
+    nodes = [n for tree in TREES.values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef)]
+    own = {node.name: set(members(node)) for node in nodes}
+    bases = {node.name: [ast.unparse(base) for base in node.bases] for node in nodes}
+
+    def of(name):
+        return own[name].union(*(of(base) for base in bases[name] if base in own))
+
+    return {name: of(name) for name in own if not any("." in base for base in bases[name])}
+
+
+def test_members_of_classes_in_texts_exist():
+    """In docstrings, comments and pages: a name from before a change would mislead."""
+    known, paths = all_members(), [ROOT / path for path in TREES]
+    texts = [*paths, *(ROOT / "docs").rglob("*.md"), *(ROOT / "kernels").iterdir()]
+    found = [
+        (path.name, f"{owner}.{name}")
+        for path in texts
+        for owner, name in re.findall(r"(?<![\w.])([A-Z]\w+)\.([a-z_]\w*)", path.read_text("utf-8"))
+        if owner in known and name not in known[owner]
+    ]
+    assert found == []

@@ -1,4 +1,4 @@
-"""Options of `clresample simulate field`: the sky that is drawn and its images."""
+"""Options of `clresample simulate field`: the simulated sky and its images."""
 
 from __future__ import annotations
 
