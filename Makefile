@@ -70,7 +70,8 @@ lint: $(STAMP)
 	$(RUN) ruff format --check .
 	$(RUN) mypy
 
-# Do the tests notice slips in a module, a room, the kernels? MODULE=clresample/sky ARGS='--n 100'
+# Tries whether tests notice slips in a module, a package or the kernels:
+# MODULE=clresample/sky ARGS='--n 100'
 mutants: $(STAMP)
 	$(RUN) tests.mutants $(MODULE) $(ARGS)
 

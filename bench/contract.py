@@ -2,8 +2,8 @@
 
     python -m bench.contract [--json FILE]
 
-A row is a batch of products (m, k) x (k, n), given as shape [m, k, n]: the shapes of the yardstick
-table, and those of the operator itself for EUCLID -> RUBIN at N = 100, 200 and 400.
+A row is a batch of products (m, k) x (k, n), given as shape [m, k, n]: shapes for comparison
+(REFERENCE_SHAPES), and those of the operator for EUCLID -> RUBIN at N = 100, 200 and 400.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .harness.cases import Case
 from .harness.clock import interleaved_ms, on_one_thread
 from .harness.options import Parser, run
 
-YARDSTICKS = (((60, 256, 256), 8), ((60, 256, 256), 64), ((256, 256, 256), 8))
+REFERENCE_SHAPES = (((60, 256, 256), 8), ((60, 256, 256), 64), ((256, 256, 256), 8))
 OPERATOR_SIZES = ((100, 1), (100, 64), (200, 1), (200, 64), (400, 1))  # (N, batch)
 COLUMNS = records.columns(
     "shape:16 batch:5d dtype:7 ours_gflops:11.1f numpy_gflops:12.1f ratio:6.2f"
@@ -69,7 +69,7 @@ def measure(shape, batch, dtype, seconds):
 
 def main(options):
     threads = on_one_thread()
-    products = list(YARDSTICKS)
+    products = list(REFERENCE_SHAPES)
     for n_model, batch in OPERATOR_SIZES:
         products += [(shape, batch) for shape in operator_shapes(n_model)]
     dtypes = ["float32", "float64"] if get_device().has_fp64 else ["float32"]

@@ -8,8 +8,8 @@ belongs to the galaxy) or in all bins together, from 3 on; a bin without an uppe
 snr_high = null in the JSON:
 
 mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric galaxies on mosaics
-            of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
-            "-as-white": it is not told
+            of pixels of 0.7, whose noise is correlated; with "-as-white" the fit assumes white
+            noise, otherwise it estimates the correlation
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly
             negative; real: sizes, arms, clumps and ellipticals of a real sky, where asked for
 light       drawn: magnitudes uniform in 20 - 29, those of all COSMOS galaxies; even: all light of a
@@ -84,7 +84,7 @@ COLUMNS = records.columns(
 
 
 def light_of(galaxies, as_drawn):
-    """What rows say of the scenes' light."""
+    """Column `light` of a row: "even" or "drawn"."""
     return "drawn" if as_drawn or galaxies == "cosmos" else "even"
 
 
@@ -102,12 +102,12 @@ def make_scene(galaxies, mode, folder, seed, as_drawn):
 
 
 def instruments(mode):
-    """Which of `scenes.MODES` one of MODES is."""
+    """Mode of `scenes.MODES` whose instruments one of MODES uses."""
     return mode.partition("-")[0]
 
 
 def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, as_drawn=False):
-    """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
+    """Results of `truth.compare` for scenes of these seeds, and the statuses of their fits.
 
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
@@ -155,7 +155,7 @@ def _statistics(pull, bias, i_scene):
 
 
 def fitted(wanted, n_scenes, options):
-    """Fit all scenes of `wanted`, pairs (galaxies, mode).
+    """Fits all scenes of `wanted`, pairs (galaxies, mode).
 
     yields, once all scenes of a pair are done: galaxies, mode, the values of its scenes in the
         order of their seeds, and how many fits ended in which way

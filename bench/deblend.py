@@ -1,4 +1,4 @@
-"""Joint deblending of simulated Euclid + Rubin scenes: speed by GalSim's, accuracy by the truth.
+"""Joint deblending of simulated Euclid + Rubin scenes: speed and accuracy.
 
     python -m bench.deblend [--quick] [--json FILE]
 

@@ -14,7 +14,7 @@ completeness        share found of those at 20 - 100 with no neighbour within 8 
                     source is found where a catalogue row within 4 pixels is its own
 faint, bright       the same at 10 - 20, and over 100
 close               share found of those over 20 that have a neighbour within 8 pixels, whatever its
-                    brightness and however near: some pairs nobody could tell apart
+                    brightness and distance: some of these pairs cannot be separated
 spurious            share of the rows that are no true source's own: nothing within 4 pixels, or
                     only what another row has found
 flux_bias           median of (flux - truth) / truth of those found over 20 without neighbour, all
@@ -62,7 +62,7 @@ COLUMNS = records.columns(
 
 
 def compared(fields, channels):
-    """What several fields' catalogues are beside their truth.
+    """Figures of several fields' catalogues compared with their truth.
 
     fields: of (table, truth, n_model); channels: names
     """

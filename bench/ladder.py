@@ -163,7 +163,7 @@ def summarise(rows):
 
 
 def is_lost(row):
-    """Whether a flux is off by LOST and LOST_SIGMA without a flag that names the neighbour."""
+    """True if a flux is off by LOST and LOST_SIGMA without a flag that names the neighbour."""
     ratio, pull = np.array(row["ratios"]), np.array(row["pulls"])
     off = ((ratio > LOST) | (ratio < 1 / LOST)) & (np.abs(pull) > LOST_SIGMA)
     return bool(off.any() and not {"AMBIGUOUS", "MISFIT"} & set(row["flags"].split()))
@@ -194,7 +194,7 @@ def coverage(rows):
 
 
 def tasks_of(options):
-    """What is to be fitted: arguments of `measure`."""
+    """Arguments of `measure` for all requested fits."""
     counts = N_QUICK if options.quick else N_SCENES
     largest = QUICK_RE_PX if options.quick else np.inf
     for case in options.only:

@@ -1,4 +1,4 @@
-"""What surveys would take, by arithmetic from what was measured: the tables of docs/scale.md.
+"""Resources for whole surveys, computed from measured figures: the tables of docs/scale.md.
 
     python -m bench.on_paper [--write]
 
@@ -34,7 +34,7 @@ def measured(text):
 
 
 def between(text, mark):
-    """What stands between the marks."""
+    """The text between the marks."""
     return text.partition(f"<!-- {mark} -->\n")[2].partition(f"<!-- end of {mark} -->")[0]
 
 

@@ -1,4 +1,4 @@
-"""SEP, scarlet2 and clresample on BlendingToolKit's blends, by its metrics: a table and a picture.
+"""SEP, scarlet2 and clresample on BlendingToolKit's blends, compared by its metrics.
 
     python -m bench.peers [--blends N] [--picture FILE] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Real scenes, all settings by default: how well they are fitted, and whether a misfit is flagged.
+"""Fits of real scenes with all settings by default: chi2, residuals and flags of misfits.
 
     python -m bench.real [--quick] [--scene SCENE.toml ...] [--json FILE]
 
@@ -108,7 +108,7 @@ def cosmos_galaxies(folder, n_galaxies):
 
 
 def scene_files(data, folder):
-    """Write docs/hst_hsc.toml with all settings by default, and either instrument alone.
+    """Writes docs/hst_hsc.toml with all settings by default, and either instrument alone.
 
     returns {scene: path}
     """
@@ -131,7 +131,7 @@ def scene_files(data, folder):
 
 
 def fit_file(path, folder):
-    """Run `clresample deblend` on a scene file; returns a function that reads what it wrote."""
+    """Runs `clresample deblend` on a scene file; returns a function that reads what it wrote."""
     out = folder / f"out-{path.stem}"
     command = ["deblend", str(path), "-o", str(out), "--no-figure", "--quiet"]
     with redirect_stdout(io.StringIO()):
@@ -142,7 +142,7 @@ def fit_file(path, folder):
 
 
 def fit_arrays(observation, sources):
-    """Fit one instrument's image with known positions; returns a function that returns the rest."""
+    """Fits one instrument's image with known positions; returns a function for the rest."""
     result = deblend([observation], sources)
     table = catalogue(result)
     return lambda: (result, table)
@@ -183,7 +183,7 @@ def rows_of(name, fit):
 
 
 def plan(data, more, n_galaxies, folder):
-    """Yield (name, fit) of every scene; more: scene files named by the user."""
+    """Yields (name, fit) of every scene; more: scene files named by the user."""
     if (data / "hsc_cosmos_blend.npz").is_file():
         observation, sources = hsc_blend(data)
         yield "hsc_blend", lambda: fit_arrays(observation, sources)

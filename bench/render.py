@@ -1,4 +1,4 @@
-"""Ours against GalSim, side by side on one thread: time and accuracy of a model stamp's rendering.
+"""Time and accuracy of a model stamp's rendering, ours and GalSim's, side by side.
 
     python -m bench.render [--quick] [--json FILE]
 
@@ -43,7 +43,7 @@ COLUMNS = records.columns(
 
 
 def plan(options):
-    """What to measure in turn: (pair, n_model, angles, batches), the main pair first."""
+    """Measurements in turn: (pair, n_model, angles, batches), the main pair first."""
     pairs = options.pairs or sorted(survey_pairs(), key=lambda pair: pair != MAIN_PAIR)
     if not options.quick:
         sizes = options.sizes or SIZES
@@ -78,7 +78,7 @@ class Contest:
         }
 
     def calls(self, batch):
-        """What is timed: name -> function of no arguments."""
+        """Timed calls: name -> function of no arguments."""
         operator = self.operator
         x = self.models[np.arange(batch) % len(self.models)]
         x_device = operator.device.put(x)

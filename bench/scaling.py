@@ -1,20 +1,20 @@
-"""How a field's time, memory and own cost go with workers, and with one giant blend.
+"""Time, memory and own cost of a field against the number of workers, and of one giant blend.
 
     python -m bench.scaling [--quick] [--json FILE]
     python -m bench.scaling --giant 1500 --sizes 3000 --workers 2
 
 The same simulated field, its files on disk, is run by `run_field` with each number of workers in
-turn, and so again (--repeats), each of which has one core: PoCL is held to one thread a worker. Of
-several turns the median speed-ups are printed at the end. The search is dealt by tiles of 1024
-pixels, so smaller fields show less than a survey's. With --giant the field is the
-core of a cluster of galaxies: so many sources, at known places, under a smooth halo that joins all
-of their light to one blend, which is cut into pieces; the sky is fitted, which takes the halo up.
+turn, several times (--repeats). Each worker has one core: PoCL uses one thread in it. At the end
+the median speed-ups of the turns are printed. The search is distributed by tiles of 1024 pixels,
+so that smaller fields have less speed-up than a survey's. With --giant the field is the core of a
+cluster of galaxies: so many sources, at known positions, under a smooth halo that joins all of
+their light to one blend, which is cut into pieces. The fitted sky absorbs the halo.
 
 wall_s, fit_s       of the run, and of its fits alone
 core_s              processor time of all processes; per source in core_s_per_source
 speed_up, fit_speed wall time with the fewest workers over that with these; of the fits alone
-own_cost            processor time of the process that deals the work while others search and fit,
-                    over that of all of them
+own_cost            processor time of the process that distributes the work while others search
+                    and fit, over that of all of them
 busy                time that workers spent in fits over workers times the fits' wall time
 tail_s              from the first worker without a task left to the end of the fits, all rounds
 peak_gb, largest_gb memory of all processes at once, and of the largest alone; pages that several
@@ -162,7 +162,7 @@ def tail_of(turns, workers):
 
 
 def rows_of(size, options, bands):
-    """Yield the rows of one field, with each number of workers, as often as asked."""
+    """Yields the rows of one field, with each number of workers, as often as asked."""
     usual = 1 if options.quick or options.giant else REPEATS
     with tempfile.TemporaryDirectory() as folder:
         toml, own = written(Path(folder) / "sky", size, options, bands)

@@ -147,7 +147,7 @@ class Scarlet2:
         ]
 
     def match(self, ours):
-        """Choose the renderer of all observations."""
+        """Chooses the renderer of all observations."""
         for o in self.observations:
             o.match(self.frame, renderer_of(self.frame, o.frame) if ours else None)
 

@@ -103,8 +103,10 @@ class Fitted:
 
 
 def moves(fit, reference):
-    """Change over the reference's error, over the fit's own, and ratio: each (S,), of the band
-    where the first is largest. NaN for sources that the fit has not."""
+    """Change over the reference's error, over the fit's own, and ratio: each (S,).
+
+    They are those of the band in which the first is largest; NaN for sources that the fit lacks.
+    """
     channels = [c for c in reference.flux if c in fit.flux]
     old, new = (np.stack([one.flux[c] for c in channels]) for one in (reference, fit))
     error, own = (np.stack([one.error[c] for c in channels]) for one in (reference, fit))
@@ -169,13 +171,13 @@ def measure(name, data, ways):
 
 
 def measure_clean(i):
-    """What is said of the clean simulated scene of a seed."""
+    """Messages about the clean simulated scene of a seed."""
     scene = spoilt_scenes.simulated(i)
     return Fitted(lambda: scene, len(scene.places)).texts
 
 
 def summarise(rows, clean):
-    """How many rows are good, and what was said of unspoilt scenes; clean: {name: texts}."""
+    """Number of good rows, and messages about unspoilt scenes; clean: {name: texts}."""
     bad = [f"{row['scene']}, {row['spoilt']}" for row in rows if not row["good"]]
     said = {}
     for texts in clean.values():

@@ -1,4 +1,4 @@
-"""Where spectra are applied to the sources: counted operations and time at each stage.
+"""Stages at which spectra are applied to the sources: counted operations and time.
 
     python -m bench.stages [--quick] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Neighbours of a bright star whose PSF is slightly wrong: what Settings.psf_error does for them.
+"""Neighbours of a bright star with a slightly wrong PSF: the effect of Settings.psf_error.
 
     python -m bench.stars [--quick] [--scenes N] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""What a source costs: many joint scenes at once, and single blends of many sources.
+"""Cost of a source: many joint scenes at once, and single blends of many sources.
 
     python -m bench.throughput [--quick] [--json FILE]
 

@@ -1,10 +1,10 @@
 """clresample: one exact operator between telescopes' pixels and PSFs, and joint deblending.
 
-Start with five things. A `Grid` has the positions of an image's pixels on the sky and a `PSF` how
-they are blurred. A `Resampler` takes a model image from one grid and PSF to another, exactly, and
-its adjoint back. An `Observation` is an instrument's image with its grid, PSF and weights, and
-`deblend` fits one scene of sources to any number of observations; `catalogue` turns what it
-returns into a table. The packages behind these names are described in docs/architecture.md.
+A `Grid` has the positions of an image's pixels on the sky, a `PSF` their blurring. A `Resampler`
+maps a model image from one grid and PSF to another, exactly; its adjoint maps back. An
+`Observation` is an instrument's image with its grid, PSF and weights. `deblend` fits one scene of
+sources to any number of observations, and `catalogue` makes a table of its result. The packages
+behind these names are described in docs/architecture.md.
 """
 
 from importlib import import_module
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-# Each room's public names and the module that defines them; imported when first used, so that the
-# command line answers at once and no OpenCL driver is touched before it is needed.
+# Each package's public names and the module that defines them, imported when first used, so that
+# the command line answers at once and no OpenCL driver is loaded before it is needed.
 _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     # the sky: pixels, PSFs, images, sources
     "sky": {
@@ -98,8 +98,8 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 _MODULE_OF = {
-    name: f"clresample.{room}.{module}"
-    for room, modules in _PUBLIC_NAMES.items()
+    name: f"clresample.{package}.{module}"
+    for package, modules in _PUBLIC_NAMES.items()
     for module, names in modules.items()
     for name in names
 }

@@ -16,9 +16,10 @@ def check_adjoint(op, rng, *, batch=(), tolerance=None, n_trials=3):
 
     op: has forward, adjoint, shape_in, shape_out and dtype; rng: a NumPy Generator
     batch: leading axes of x and y; tolerance: None takes that of op.dtype
-    y is random, and in every trial also A x itself, to which a wrong scale matters most
     returns the largest of the left side over |A x| |y|
-    AssertionError: the test fails, with its figures
+
+    Each trial uses two y: a random one, and A x itself, for which a wrong scale shows most.
+    Raises AssertionError, with both sides, if the test fails.
     """
     if tolerance is None:
         tolerance = ADJOINT_TOLERANCE[np.dtype(op.dtype).name]
@@ -56,7 +57,8 @@ def check_prox(prox, penalty, shape, rng, *, step=1.0, convex=True, tolerance=1e
 
     prox: from an array of `shape` to one, new or its own; penalty: f, a number or inf
     rng: a NumPy Generator; tolerance: of |y|^2, from the arithmetic's rounding
-    AssertionError: one of them fails, with its figures
+
+    Raises AssertionError, with the values compared, if one of the tests fails.
     """
     values = [rng.normal(size=shape) * rng.choice([0.1, 1, 3]) for _ in range(n_trials)]
     points = [np.array(prox(y.copy()), dtype=float) for y in values]

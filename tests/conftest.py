@@ -29,7 +29,7 @@ from clresample import Device, DeviceError, get_device, list_devices
 # Shells start what runs in the background with Ctrl-C ignored, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-pytest_plugins = ("helpers.builds", "helpers.field_run")  # fixtures of several rooms
+pytest_plugins = ("helpers.builds", "helpers.field_run")  # fixtures of several folders
 NO_DOUBLE = "has no double precision: use float32"
 
 
@@ -56,7 +56,7 @@ def _devices():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem):
-    """Skip a test that asks a device for float64 which it does not have."""
+    """Skips a test that asks a device for float64 which it does not have."""
     try:
         return (yield)
     except DeviceError as error:
@@ -92,7 +92,7 @@ def device(request):
 
 @pytest.fixture(scope="session", autouse=True)
 def as_asked(request):
-    """What the options ask of all devices; the Guards, where asked for."""
+    """Applies the options to all devices; yields the Guards, if they were requested."""
     with pytest.MonkeyPatch.context() as patch:
         if request.config.getoption("--as-gpu"):
             opened = Device.__init__

@@ -20,7 +20,7 @@ TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
 def links(text):
-    """What a Markdown text links to or shows, code blocks apart."""
+    """Links and images of a Markdown text, code blocks apart."""
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     return re.findall(r"\]\(([^)\s]+)\)", prose)
 

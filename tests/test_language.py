@@ -14,16 +14,24 @@ import clresample
 MAX_FIRST_LINE = 93
 MADE_ELSEWHERE = {"Device"}  # by `get_device`: users call no constructor
 QUESTION = re.compile(r"(What|Who|Where|Which|How|Whether)\b")
-FILES = sorted((ROOT / "clresample").rglob("*.py"))
 PUBLIC = [
     name for name in sorted(clresample.__all__)
     if name not in MADE_ELSEWHERE and callable(getattr(clresample, name))
 ]  # fmt: skip
-TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in FILES}
+
+
+def trees_of(folder):
+    """{path: syntax tree} of the Python files in a folder of the checkout."""
+    paths = sorted((ROOT / folder).rglob("*.py"))
+    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in paths}
+
+
+TREES = trees_of("clresample")
+ALL_TREES = TREES | trees_of("bench") | trees_of("tools")
 
 
 def faults_of(docstring):
-    """What is wrong with the first line of a docstring, a word each."""
+    """Faults of the first line of a docstring, a word each."""
     first, *rest = docstring.split("\n")
     return [
         *(["a question"] if QUESTION.match(first) else []),
@@ -41,10 +49,20 @@ def documented(tree):
                 yield getattr(node, "name", "the module"), docstring
 
 
-@pytest.mark.parametrize("path", TREES)
+@pytest.mark.parametrize("path", ALL_TREES)
 def test_first_lines_are_one_sentence_on_one_line(path):
-    found = {name: faults_of(text) for name, text in documented(TREES[path])}
+    found = {name: faults_of(text) for name, text in documented(ALL_TREES[path])}
     assert {name: faults for name, faults in found.items() if faults} == {}
+
+
+def test_first_lines_of_tests_are_no_questions():
+    found = [
+        (path, name)
+        for path, tree in trees_of("tests").items()
+        for name, text in documented(tree)
+        if "a question" in faults_of(text)
+    ]
+    assert found == []
 
 
 @pytest.mark.parametrize(
@@ -120,3 +138,38 @@ def test_public_parameters_with_a_unit_in_their_name_have_it_or_are_named_in_ful
         given = re.search(rf"\b{parameter}\b(?: \([^)]*\))? \[([^\]]*)\]", text)
         if unit and given:
             assert unit in given[1].replace("pixel", "px"), (parameter, given[1])
+
+
+def members(node):
+    """Names in a class: methods, arguments, fields, and attributes that it sets."""
+    for inner in ast.walk(node):
+        match inner:
+            case ast.FunctionDef(name=name) | ast.arg(arg=name) | ast.Name(id=name):
+                yield name
+            case ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name
+
+
+def all_members():
+    """{class of the package: its members and those of its bases}, but for foreign bases."""
+    nodes = [n for tree in TREES.values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef)]
+    own = {node.name: set(members(node)) for node in nodes}
+    bases = {node.name: [ast.unparse(base) for base in node.bases] for node in nodes}
+
+    def of(name):
+        return own[name].union(*(of(base) for base in bases[name] if base in own))
+
+    return {name: of(name) for name in own if not any("." in base for base in bases[name])}
+
+
+def test_members_of_classes_in_texts_exist():
+    """In docstrings, comments and pages: a name from before a change would mislead."""
+    known, paths = all_members(), [ROOT / path for path in TREES]
+    texts = [*paths, *(ROOT / "docs").rglob("*.md"), *(ROOT / "kernels").iterdir()]
+    found = [
+        (path.name, f"{owner}.{name}")
+        for path in texts
+        for owner, name in re.findall(r"(?<![\w.])([A-Z]\w+)\.([a-z_]\w*)", path.read_text("utf-8"))
+        if owner in known and name not in known[owner]
+    ]
+    assert found == []

@@ -97,7 +97,7 @@ def violations(name, source, is_package=False):
 
 
 def graph():
-    """Which modules of clresample's each of them imports."""
+    """Modules of clresample that each of them imports."""
     return {
         name: {
             target

@@ -45,7 +45,7 @@ def run(*command, cwd):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where the wheel and the sdist are built, without network."""
+    """Builds the wheel and the sdist in a folder, without network."""
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "hatchling", "build", "-d", folder, cwd=ROOT)

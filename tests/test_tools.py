@@ -52,7 +52,7 @@ def test_every_kernel_is_one_that_grind_looks_for():
 
 @pytest.mark.parametrize("fault", grind.FAULTS)
 def test_planted_faults_build(device, fault):
-    """Whether they are reported, tools/grind.sh asks of Oclgrind itself."""
+    """tools/grind.sh checks that Oclgrind reports them."""
     import pyopencl as cl
 
     cl.Kernel(cl.Program(device.context, grind.FAULTS[fault]).build(), fault)

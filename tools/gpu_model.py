@@ -1,4 +1,4 @@
-"""Predicts by arithmetic what a GPU would take for joint fits, from counts made on this machine.
+"""Predicts by arithmetic a GPU's time for joint fits, from counts made on this machine.
 
     python tools/gpu_model.py [--scenes 8] [--groups 32 256 1024] [--card NAME] [--json FILE]
 
@@ -77,7 +77,7 @@ CARDS = (
 
 @dataclass(frozen=True)
 class Counts:
-    """What fits of `n_scenes` side by side took.
+    """Counts of the fits of `n_scenes` side by side.
 
     kernels {name: (launches, operations, bytes)}; operations are 0 where they are not counted
     n_waits: copies that the host waits for; n_rounds: launches of the solver's step
@@ -103,7 +103,7 @@ class Prediction:
 
     @property
     def limit(self):
-        """What most of the time goes to."""
+        """The part that takes most of the time."""
         parts = {"host": self.host_s, "device": self.device_s, "waits": self.waits_s}
         return max(parts, key=parts.__getitem__)
 

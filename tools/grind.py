@@ -76,7 +76,7 @@ def all_kernels():
 
 
 def watch(device, kind):
-    """Build kernels as for `kind`; returns the set to which names of launched kernels are added."""
+    """Builds kernels as for `kind`; returns the set that collects names of launched kernels."""
     device.kind, device.simulated = kind.upper(), False
     launched, launch, made = set(), Launcher.__call__, Device.launcher
 
@@ -215,7 +215,7 @@ WORKS = (resample, render, constrain, leave, vary, fit)
 
 
 def plant(device, fault):
-    """Launch a kernel with a fault."""
+    """Launches a kernel with a fault."""
     import pyopencl as cl
 
     kernel = cl.Kernel(cl.Program(device.context, FAULTS[fault]).build(), fault)

@@ -44,7 +44,7 @@ def operators(device):
 
 
 def wrong_renders(op, n, n_threads):
-    """How many of n calls, forward and adjoint in turn, differ from the same call alone."""
+    """Number of n calls, forward and adjoint in turn, that differ from the same call alone."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(N_DIFFERENT, *op.shape_in)).astype(np.float32)
     y = rng.normal(size=(N_DIFFERENT, *op.shape_out)).astype(np.float32)
@@ -62,7 +62,7 @@ def wrong_renders(op, n, n_threads):
 
 
 def wrong_fits(device, n, n_threads):
-    """How many of n fits of blends of equal geometry, which share operators, differ."""
+    """Number of n fits of blends of equal geometry, which share operators, that differ."""
     blends = [blend(seed, device) for seed in range(N_DIFFERENT)]
     settings = Settings(max_iter=15)
 

@@ -1,4 +1,4 @@
-"""What all benchmarks share.
+"""Code that all benchmarks share.
 
 options   the commands' options and their one-line answers; surveys and survey pairs
 clock     one thread for each side, timing by turns, worker processes

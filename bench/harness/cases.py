@@ -100,7 +100,7 @@ class Case:
 
 
 def check_observed(case):
-    """Raise BadOption for a case whose model stamp holds no whole observed pixel."""
+    """Raises BadOption for a case whose model stamp holds no whole observed pixel."""
     if case.n_obs == 0:
         raise BadOption(
             f"--sizes {case.n_model}: no observed pixel from {case.survey_in.name} to "

@@ -25,7 +25,7 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THRE
 
 
 def on_one_thread():
-    """Start this command anew with one thread for each side, unless it was started so.
+    """Starts this command anew with one thread for each side, unless it was started so.
 
     NumPy's and FFT libraries read these variables when they are loaded.  PoCL's simplest device
     runs kernels in the calling thread: "basic", called "cpu-minimal" from version 4 on.  GalSim
@@ -44,7 +44,7 @@ def on_one_thread():
 
 
 def on_all_cores():
-    """Start this command anew with OpenCL on all cores, as a user has it, and the rest on one.
+    """Starts this command anew with OpenCL on all cores, as a user has it, and the rest on one.
 
     On matrices as small as a fit's, threads of NumPy's libraries wait for each other and OpenCL's.
     """
@@ -52,7 +52,7 @@ def on_all_cores():
 
 
 def _start_with(wanted):
-    """Start this command anew under these variables, unless it has them; returns them as text."""
+    """Starts this command anew under these variables, unless it has them; returns them as text."""
     if any(os.environ.get(name) != value for name, value in wanted.items()):
         command = [sys.executable, *sys.orig_argv[1:]]
         os.execve(sys.executable, command, {**os.environ, **wanted})

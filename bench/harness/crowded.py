@@ -1,4 +1,4 @@
-"""One blend of many galaxies, as Euclid and Rubin see it: fields beyond the stamps of the paper."""
+"""One blend of many galaxies in Euclid and Rubin: fields beyond the stamps of the paper."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def crowded_blend(seed, n_sources, n_model, sky="plain"):
 
 
 def _observe(survey, grid, galaxies, positions_arcsec, magnitudes, rng):
-    """What a survey sees, each galaxy drawn on a cutout of the grid about it."""
+    """Images of a survey (C, Ny, Nx), each galaxy drawn on a cutout of the grid around it."""
     data = survey.noise_sigma[:, None, None] * rng.standard_normal((survey.n_bands, *grid.shape))
     reach_px = int(np.ceil(REACH_ARCSEC / survey.pixel_scale_arcsec))
     counts, top = survey.counts(magnitudes), np.array(grid.shape)

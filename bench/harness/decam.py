@@ -95,7 +95,7 @@ def pair(folder):
 
 
 def write_scene(folder, found, places=None):
-    """Write exposures as FITS files with a scene file beside them, and return its path.
+    """Writes exposures as FITS files with a scene file beside them; returns its path.
 
     places (S, 2) [deg]: ra, dec of the sources; None leaves them to detection
     """
@@ -119,7 +119,7 @@ def write_scene(folder, found, places=None):
 
 
 def scene_files(data, folder):
-    """Write the scenes of the data folder that are there: {scene: path of its file}."""
+    """Writes the scenes of the data folder that are there: {scene: path of its file}."""
     paths = {}
     for name in ("decam_galaxy", "decam_star"):
         if (data / name).is_dir():
@@ -133,7 +133,7 @@ def scene_files(data, folder):
 
 
 def measured(table, band):
-    """What a catalogue says of each source in a band, as plain numbers."""
+    """Position, flags, flux and its error of each source of a catalogue in a band."""
     sky = [name for name in ("ra", "dec") if name in table.colnames]
     columns = {name: table[name] for name in (*sky, "flags")}
     columns |= {key: table[f"{key}_{band}"] for key in ("flux", "flux_err")}

@@ -1,4 +1,4 @@
-"""Catalogues of simulated fields beside their truth: what was found, what was not there, fluxes."""
+"""Catalogues of simulated fields compared with their truth: completeness, purity, fluxes."""
 
 from __future__ import annotations
 
@@ -104,8 +104,11 @@ def fluxes(table, truth, chosen, own, channels):
 
 
 def typical(errors):
-    """1.4826 median |error| of the finite ones, NaN of none: their scatter about zero, which for a
-    normal distribution without bias is its standard deviation."""
+    """1.4826 median |error| of the finite ones, NaN of none.
+
+    This is their scatter about zero; for a normal distribution without bias it is its standard
+    deviation.
+    """
     errors = np.abs(np.asarray(errors)[np.isfinite(errors)])
     return float(1.4826 * np.median(errors)) if errors.size else np.nan
 

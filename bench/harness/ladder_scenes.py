@@ -1,4 +1,4 @@
-"""Scenes of bench.ladder as images: sources under PSF and pixel, noise of the sky, and the truth.
+"""Scenes of bench.ladder as images: sources under PSF and pixel, sky noise, and the truth.
 
 Two kinds of images (MODES): one survey of three bands under a Moffat PSF, or Euclid and Rubin on
 the same sky. GalSim draws every source alone.
@@ -80,7 +80,7 @@ class Item:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a fit is given, and the truth.
+    """Input of a fit, and the truth.
 
     inside, total (S, C) [counts]: flux of each source inside the image and of all of it
     """
@@ -117,7 +117,7 @@ def instruments(mode):
 
 
 def make_scene(mode, items, rng):
-    """Draw a scene of Items, the first of them within half a pixel of the frame's middle."""
+    """Draws a scene of Items, the first of them within half a pixel of the frame's middle."""
     finest = instruments(mode)[0]
     scale, side_px = finest.scale_arcsec, _side_px(items)
     middle = rng.uniform(-0.5, 0.5, 2)

@@ -13,8 +13,11 @@ LOOK_S = 1.0
 
 
 class TreeMemory(threading.Thread):
-    """Watches the memory of a process's tree: `peak` [bytes] of all at once, `largest` of one
-    process, 0 where the system does not tell; `spent_s` [s]: processor time of watching.
+    """Watches the memory of a process and all its descendants.
+
+    peak [bytes]: largest sum over all of them; largest [bytes]: of one process; both 0 if the
+        system does not report memory
+    spent_s [s]: processor time of watching
 
     Proportional set size: pages that several processes share are counted once in all.
     """
@@ -31,7 +34,7 @@ class TreeMemory(threading.Thread):
             self.spent_s = time.thread_time()
 
     def stop(self):
-        """End the watch; returns the peak [bytes]."""
+        """Ends the watch; returns the peak [bytes]."""
         self.over.set()
         self.join()
         return self.peak

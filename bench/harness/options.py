@@ -17,7 +17,7 @@ REPORT = ROOT / "bench" / "report"
 
 
 class BadOption(Exception):
-    """What a user asked for cannot be done; the message is one line."""
+    """A request that cannot be fulfilled; the message is one line for the user."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,21 +34,21 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
     def add(self, name, about, **given):
-        """Add an option; a default, where it is a number or a word, ends its help."""
+        """Adds an option; a default, where it is a number or a word, ends its help."""
         shown = given.get("default") is not None and isinstance(given["default"], (int, float, str))
         about = about.replace("%", "%%") + " (%(default)s)" * shown
         self.add_argument(f"--{name}", help=about, **given)
 
     def add_flag(self, name, about):
-        """Add an option without a value."""
+        """Adds an option without a value."""
         self.add_argument(f"--{name}", action="store_true", help=about.replace("%", "%%"))
 
     def add_number(self, name, about, default=None, kind=int, metavar="N", **given):
-        """Add an option of a number above 0, or of several."""
+        """Adds an option of a number above 0, or of several."""
         self.add(name, about, type=positive(kind), default=default, metavar=metavar, **given)
 
     def add_scenes(self, quick, all_of_them, what="how many scenes"):
-        """Add --quick and --scenes, see `n_scenes`; quick, all_of_them: numbers of scenes."""
+        """Adds --quick and --scenes, see `n_scenes`; quick, all_of_them: numbers of scenes."""
         self.set_defaults(scenes_by_default=(all_of_them, quick))
         self.add_flag("quick", f"{quick} scenes")
         self.add_number("scenes", f"{what} ({all_of_them})")
@@ -97,7 +97,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def n_scenes(options):
-    """How many scenes the options of `Parser.add_scenes` ask for."""
+    """Number of scenes that the options of `Parser.add_scenes` request."""
     return options.scenes or options.scenes_by_default[options.quick]
 
 
@@ -149,7 +149,7 @@ def data_folder():
 
 
 def run(main, parser):
-    """Run `main(options)`; a user's mistake is answered in one line, with exit status 2."""
+    """Runs `main(options)`; a user's mistake is answered in one line, with exit status 2."""
     options = parser.parse_args()
     json_file, folder = (getattr(options, name, None) for name in ("json", "folder"))
     try:

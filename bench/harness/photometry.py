@@ -1,4 +1,4 @@
-"""What others measure of blended sources, on the same images and at the same positions.
+"""Other methods of photometry for blended sources, on the same images at the same positions.
 
 aperture   all bands brought to the broadest band's PSF by our operator, then sums in circles (sep)
 forced     profiles from the sharpest band, their fluxes in each band by least squares with that
@@ -55,8 +55,10 @@ class Cutout:
 
 
 def aperture_fluxes(cutout, place):
-    """Sums (n_radii, C) [counts] in circles about a place (2,) [px of the first mosaic], all bands
-    brought to the broadest PSF, which must be the last mosaic's."""
+    """Sums (n_radii, C) [counts] in circles about a place (2,) [px of the first mosaic].
+
+    All bands are matched to the broadest PSF, which must be the last mosaic's.
+    """
     import sep
 
     target, psfs = cutout.grids[-1], cutout.psfs[-1]
@@ -85,8 +87,10 @@ def _broadest(psf):
 
 
 def profiles(cutout, places):
-    """Images (S, ny, nx) of unit sum of the sources at places (S, 2), under the PSF of the sharpest
-    band: an elliptical exponential each, of the moments of its own pixels there."""
+    """Images (S, ny, nx) of unit sum at places (S, 2), under the PSF of the sharpest band.
+
+    Each is an elliptical exponential with the moments of the source's own pixels in that band.
+    """
     image, weight = cutout.data[0][0], cutout.weights[0][0]
     sigma = 1 / np.sqrt(weight.max())
     local = np.asarray(places) - cutout.low
@@ -190,9 +194,11 @@ def point_errors(mosaics):
 
 
 def least_scatter(ratios, alone, scatter):
-    """Scatter of flux over truth (J, C), the least of several radii's (n, J, C), once each channel
-    is scaled so that sources without a neighbour, `alone` (K, C) or (n, K, C), have the truth in
-    their median."""
+    """Scatter of flux over truth (J, C), the least of several radii's (n, J, C).
+
+    Each channel is scaled first so that sources without a neighbour, `alone` (K, C) or (n, K, C),
+    have the truth in their median.
+    """
     stacks, singles = (r if r.ndim == 3 else r[None] for r in (ratios, alone))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without any is NaN

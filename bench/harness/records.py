@@ -1,4 +1,4 @@
-"""What a run leaves behind: its record, tables on the screen, JSON, and a log to go on from."""
+"""Output of a run: its record, tables on the screen, JSON, and a log to continue from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .options import BadOption
 
 
 def record(threads):
-    """Where and when: device, versions, date, and how each side was held to one thread."""
+    """Record of a run: device, versions, date, and how each side was limited to one thread."""
     device = get_device()
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -39,12 +39,12 @@ def columns(text):
 
 
 def print_head(columns):
-    """Print the names of a table's columns."""
+    """Prints the names of a table's columns."""
     print("  ".join(name.rjust(width) for name, width, _ in columns), flush=True)
 
 
 def print_row(columns, row):
-    """Print one line of the table; what is not a number is printed as it is."""
+    """Prints one line of the table; what is not a number is printed as it is."""
     cells = []
     for name, width, form in columns:
         is_number = isinstance(row[name], (int, float))
@@ -53,7 +53,7 @@ def print_row(columns, row):
 
 
 def show(columns, found, record, path, *, summarise=None, below=None, order=None, **more):
-    """Print a record, then rows as they are found; write all to a JSON file.
+    """Prints a record, then rows as they come; writes all to a JSON file.
 
     path: the file, or None
     summarise: from all rows to the groups of figures that are printed at the end
@@ -81,7 +81,7 @@ def show(columns, found, record, path, *, summarise=None, below=None, order=None
 
 
 def print_stages(row):
-    """Print the seconds of a row's stages, and the calling thread's milliseconds, where it has."""
+    """Prints the seconds of a row's stages, and the calling thread's milliseconds, where it has."""
     if row["stage"]:
         print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
     if row.get("host_ms"):
@@ -90,19 +90,19 @@ def print_stages(row):
 
 
 def print_lines(texts):
-    """Print texts below a row, a line each."""
+    """Prints texts below a row, a line each."""
     for text in texts:
         print(f"    {text}", flush=True)
 
 
 def print_record(record):
-    """Print a record, one name and value on each line."""
+    """Prints a record, one name and value on each line."""
     for name, value in record.items():
         print(f"{name}: {value}")
 
 
 def print_summary(summary):
-    """Print groups of figures {group: {name: value}}, one figure on each line."""
+    """Prints groups of figures {group: {name: value}}, one figure on each line."""
     for group, figures in summary.items():
         print(f"{group}:")
         for name, value in figures.items():
@@ -110,23 +110,23 @@ def print_summary(summary):
 
 
 def write_json(path, content):
-    """Write JSON whole or not at all; infinite and undefined numbers become null."""
+    """Writes JSON whole or not at all; infinite and undefined numbers become null."""
     write_text(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
 
 
 def read_json(path):
-    """Read what `write_json` wrote; null, an infinite or undefined number, becomes NaN."""
+    """Reads what `write_json` wrote; null, an infinite or undefined number, becomes NaN."""
     return _numbers(json.loads(path.read_text(encoding="utf-8")))
 
 
 def write_text(path, text):
-    """Write a file whole or not at all. Raises FileError where it cannot be written."""
+    """Writes a file whole or not at all. Raises FileError where it cannot be written."""
     with atomic_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 class Log:
-    """What a run has found so far, one line of JSON for each part; the next run goes on from it.
+    """Log of a run, one line of JSON for each part done; the next run continues from it.
 
     path: the file
     settings: what all parts of it share; a file made with others is refused by `BadOption`
@@ -153,7 +153,7 @@ class Log:
             self.done[tuple(key)] = part
 
     def append(self, key, part):
-        """Keep a part, `key` being a tuple of strings and numbers; its line is written at once."""
+        """Keeps a part, `key` being a tuple of strings and numbers; its line is written at once."""
         self._append([key, part])
         self.done[key] = part
 

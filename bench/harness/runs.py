@@ -26,8 +26,10 @@ from .options import ROOT
 
 
 def found_in(field, folder):
-    """Positions (R, 2) [model px] that the search alone finds in a field's files, and its processor
-    and wall time [s]."""
+    """Positions (R, 2) [model px] that the search alone finds in a field's files.
+
+    Returns also its processor and wall time [s].
+    """
     mosaics = read_field(write_field(folder, field)[0]).mosaics
     core, wall = time.process_time(), time.perf_counter()
     reference, options = reference_grid(mosaics), FieldOptions()

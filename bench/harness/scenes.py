@@ -55,7 +55,7 @@ def opened(folder):
 
 
 def blend(scene, mode, *, profiles=None):
-    """What a fit in one of MODES is given: images, true positions, Euclid's pixels.
+    """The Blend of a scene in one of MODES: images, true positions, Euclid's pixels.
 
     profiles (S, Ny, Nx): where the morphologies start; None leaves that to the fit
     """
@@ -122,7 +122,7 @@ def chi2_of_all(result):
 
 
 def iterations(result):
-    """How many iterations a fit took."""
+    """Number of iterations of a fit."""
     return summary(result)["n_iterations"]
 
 

@@ -59,8 +59,10 @@ def hsc_blend(data):
 
 
 def hsc_cutout(data):
-    """HSC's images of the HST + HSC pair, sources detected; too much sky was subtracted from them,
-    which is put back."""
+    """HSC's images of the HST + HSC pair, with sources detected.
+
+    Too much sky was subtracted from the files, and is added here.
+    """
     folder = data / "hst_hsc"
     images, header = fits.getdata(folder / "hsc_grizy.fits", header=True)
     found = np.array([background(image) for image in images])

@@ -1,4 +1,4 @@
-"""What a catalogue says of simulated galaxies, beside the truth and in units of its own errors.
+"""Compares catalogues of simulated galaxies with the truth, in units of their own errors.
 
 quantity      columns of the catalogue, each with a column of its error; truth
 flux          flux_CHANNEL [uJy]; that of the whole galaxy, also beyond the stamp

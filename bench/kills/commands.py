@@ -1,8 +1,8 @@
-"""Every command killed while it writes: whether its outputs are whole, as a set, and can be redone.
+"""Kills every command while it writes: outputs must be whole, as a set, and can be redone.
 
 Each command is run undisturbed, into an empty place and over files that are there (--overwrite);
 then killed so many times in each way, spread over all that it does in its folder, see dying.py:
-with SIGKILL as it opens, moves, links or removes something, and by turns in the midst of a file.
+with SIGKILL as it opens, moves, links or removes something, and by turns inside a file.
 
 command    what was run; over: over files that were there
 moment     what it was about to do, or how many bytes of which file were written
@@ -97,7 +97,7 @@ def ended(log, out, moment, n_bytes, words):
 
 
 def content(path):
-    """What a file says, but for times; its bytes where it is not what its name says."""
+    """Content of a file without its times; its bytes if it cannot be read as its name promises."""
     try:
         if path.suffix == ".fits":
             with warnings.catch_warnings():

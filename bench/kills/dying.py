@@ -1,4 +1,4 @@
-"""`clresample` that ends in the midst of its writing, at a moment that is told beforehand.
+"""`clresample` that ends during its writing, at a moment that is chosen beforehand.
 
     python -m bench.kills.dying LOG FOLDER MOMENT N_BYTES COMMAND ...
 
@@ -20,7 +20,7 @@ PATH_OF |= {"os.rename": 1, "os.link": 1}  # which of an event's values is the p
 
 
 def watch(log, folder, moment, n_bytes):
-    """Count moments from now on, in Python's audit events; die at the given one."""
+    """Counts moments from now on, in Python's audit events; dies at the given one."""
     seen, inside = 0, os.path.join(os.path.realpath(folder), "")
     lines = open(log, "a", buffering=1)  # noqa: SIM115 - open until the process ends
 

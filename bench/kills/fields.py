@@ -1,4 +1,4 @@
-"""Fields killed, starved and damaged: whether they end with the same catalogue whatever happens.
+"""Kills, starves and damages runs of fields: all must end with the same catalogue.
 
 A small simulated field is run once undisturbed. Then, each time in a new folder, the command or one
 of its workers is killed (SIGKILL) at a random moment; a run that was killed is resumed, and killed
@@ -70,8 +70,10 @@ TILES = "\n[field]\ntile_px = 64\noverlap_px = 16\n"
 
 
 def start(sky, out, *options, workers=None, environment=None, before=None):
-    """The command, begun; it goes on where a run in this folder has begun. For its errors see
-    `told`: a file holds them, since a pipe that nobody reads would stop it when full."""
+    """Starts the command; it resumes a run if the folder has one.
+
+    Its standard error goes to a file, which `told` reads: a full pipe would block the process.
+    """
     if (out / "work" / "run.json").exists():
         options = *options, "--resume"
     words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
@@ -90,7 +92,7 @@ def start(sky, out, *options, workers=None, environment=None, before=None):
 
 
 def told(process):
-    """What a process of `start` says on standard error, once it has ended."""
+    """Text of a process of `start` on standard error, after its end."""
     process.wait()
     with process.errors as file:
         file.seek(0)
@@ -103,8 +105,10 @@ def parts_in(out):
 
 
 def kill_at(process, seconds, what, rng, number=signal.SIGKILL):
-    """Send a signal to the process, or to one of its children, after so many seconds; whether there
-    was one."""
+    """Sends a signal to the process, or to one of its children, after so many seconds.
+
+    Returns False if there was none.
+    """
     end = time.monotonic() + seconds
     while time.monotonic() < end and process.poll() is None:
         time.sleep(LOOK_S)
@@ -121,7 +125,7 @@ def kill_at(process, seconds, what, rng, number=signal.SIGKILL):
 
 
 def same_bytes(out, whole):
-    """Whether two runs have left the same catalogue."""
+    """True if two runs have the same catalogue, byte for byte."""
     return (out / "catalogue.fits").read_bytes() == (whole / "catalogue.fits").read_bytes()
 
 
@@ -157,7 +161,7 @@ def full_disk(sky, out, whole, took_s):
 
 
 def _mount(folder, room):
-    """Whether a file system of so many bytes could be mounted on a folder."""
+    """Mounts a file system of so many bytes on a folder; returns False if that fails."""
     words = ["mount", "-t", "tmpfs", "-o", f"size={room}", "clresample-soak", str(folder)]
     try:
         return subprocess.run(words, capture_output=True, check=False).returncode == 0
@@ -202,7 +206,7 @@ def damaged_tile(sky, out, whole, took_s):
 
 
 def damage(path):
-    """Overwrite the last tile of a compressed image; its first row and number of rows [px]."""
+    """Overwrites the last tile of a compressed image; returns its first row and height [px]."""
     with fits.open(path, disable_image_compression=True) as hdus:
         header, begin = hdus["SCI"].header, hdus["SCI"].fileinfo()["datLoc"]
         n_rows, n_all = header["ZTILE2"], header["ZNAXIS2"]
@@ -220,8 +224,7 @@ def damage(path):
 
 
 def compared(rows, clean):
-    """How many sources of a clean catalogue others do not have, and by how many errors the fluxes
-    of the rest differ at most."""
+    """Number of sources missing in `rows`, and the largest change of a flux [errors]."""
     shared, i, j = np.intersect1d(rows["id"], clean["id"], return_indices=True)
     worst = 0.0
     for name in [c for c in clean.colnames if c.startswith("flux_err_")]:
@@ -245,7 +248,7 @@ def small_device(sky, out, whole, took_s):
 
 
 def unfinished(out):
-    """Whether a run writes a file, or has left one as it was killed."""
+    """True while a run writes a file, and if a killed run has left one unfinished."""
     return any((out / "work").glob(".part-*"))
 
 

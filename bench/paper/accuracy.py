@@ -29,7 +29,7 @@ VISUAL_PAIRS = (("HST", "RUBIN"), ("EUCLID", "EUCLID"), ("EUCLID", "RUBIN"))
 
 
 def run_chunks(cases, options, log):
-    """Measure what the log lacks, in several processes, each on one thread."""
+    """Measures what the log lacks, in several processes, each on one thread."""
     chunks = [
         (case, start, min(start + CHUNK, options.galaxies))
         for start in range(0, options.galaxies, CHUNK)
@@ -129,7 +129,7 @@ def images(case, i, galaxies):
 
 
 def draw_maps(folder, name, pairs):
-    """Draw the figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
+    """Draws the figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
     names = list(survey_table(False))
 
     def table(value):
@@ -173,7 +173,7 @@ def draw_maps(folder, name, pairs):
 
 
 def draw_examples(folder, name, found, chosen, surveys, galaxies):
-    """Draw the figures visual, of a galaxy of median SDR, and visual_edge, of the worst.
+    """Draws the figures visual, of a galaxy of median SDR, and visual_edge, of the worst.
 
     returns titles and SDRs [dB] of the first
     """
@@ -189,7 +189,7 @@ def draw_examples(folder, name, found, chosen, surveys, galaxies):
 
 
 def evaluate(folder, name, found, surveys, galaxies):
-    """Draw all figures; return the numbers from which the findings are made."""
+    """Draws all figures; returns the numbers from which the findings are made."""
     pairs = [summarise(case, columns) for case, columns in found.items()]
     draw_maps(folder, name, pairs)
     # where both surveys are the same, ours cannot lose

@@ -1,4 +1,4 @@
-"""What an accuracy run says about section 5: means, their scatter, and GalSim's sinc."""
+"""Findings of an accuracy run about section 5: means, their scatter, and GalSim's sinc."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _residuals(pairs):
 
 
 def _trend(off):
-    """How SDRs follow the ratio of pixel sizes, in proportion to which the model stamps grow."""
+    """Trend of SDRs with the ratio of pixel sizes; model stamps grow in proportion to it."""
     doublings = np.log2([pair["n_model"] for pair in off])
     quintic, ours, sinc = (
         np.polyfit(doublings, [pair["mean"][method] for pair in off], 1)[0]

@@ -1,4 +1,4 @@
-"""What an accuracy run says about single stamps: their residuals, and where GalSim wins and why."""
+"""Findings of an accuracy run about single stamps: residuals, and pairs that GalSim wins."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Map:
 
 
 def heat_maps(path, maps, *, rows, columns, row_label, column_label):
-    """Draw maps side by side.
+    """Draws maps side by side.
 
     maps: list of `Map`; rows, columns: their names, the same for all; row_label, column_label:
         what they are
@@ -91,7 +91,7 @@ class Images:
 
 
 def resampled(path, cases):
-    """Draw truths, estimates and residuals as in the paper, two columns for each of `Images`."""
+    """Draws truths, estimates and residuals as in the paper, two columns for each of `Images`."""
     size = 3.3 * len(cases), 5.3  # inches
     figure = import_figure()(figsize=size, dpi=DPI, layout="constrained")
     for case, part in zip(cases, figure.subfigures(1, len(cases), squeeze=False, wspace=0.02)[0]):
@@ -121,7 +121,7 @@ def _sky(ax, image, limits, title):
 
 
 def edges(path, margin, edge, worst):
-    """Draw what light at the stamp's edge does, and what padding does to the worst cases.
+    """Draws what light at the stamp's edge does, and what padding does to the worst cases.
 
     margin [dB], edge: ours above GalSim's default, and relative light in the edge, per stamp
     worst: rows of `accuracy.padded`
@@ -153,7 +153,7 @@ def edges(path, margin, edge, worst):
 
 
 def time_ratios(path, rows, fits, paper):
-    """Draw times over GalSim's default against M: the paper's scheme and ours, with straight lines.
+    """Draws times over GalSim's default against M: the paper's scheme and ours, and fitted lines.
 
     rows: of `timing`, one pair and size each; fits: scheme -> (intercept, slope); paper: likewise
     """
@@ -184,7 +184,7 @@ def time_ratios(path, rows, fits, paper):
 
 
 def absolute_timings(path, sizes, means, setups):
-    """Draw mean times [ms] of every method against N, and of its set-up: name -> values by size."""
+    """Draws mean times [ms] of each method and its set-up against N: name -> values by size."""
     figure, axes = _figure(1, 2, 4.6, 3.7)
     for ax, times, title in zip(
         axes[0], (means, setups), ("one image, mean over survey pairs", "set-up, once")
@@ -198,7 +198,7 @@ def absolute_timings(path, sizes, means, setups):
 
 
 def schemes(path, rows):
-    """Draw both schemes' times [ms] and their ratio against N; rows: as `timing` writes them."""
+    """Draws both schemes' times [ms] and their ratio against N; rows: as `timing` writes them."""
     figure, axes = _figure(1, 2, 4.6, 3.7)
     left, right = axes[0]
     for row, style in zip(rows, ("-", "--")):
@@ -247,7 +247,7 @@ def _figure(n_y, n_x, width, height):
 
 
 def save(path, figure):
-    """Write a PNG of 256 colours, white among them, whole or not at all. Raises FileError."""
+    """Writes a PNG of 256 colours, white among them, whole or not at all. Raises FileError."""
     from PIL import Image  # comes with matplotlib
 
     drawn = io.BytesIO()

@@ -23,7 +23,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the numbers of a run say about a claim.
+    """Result of a run about a claim.
 
     claim: the statement
     number: ours, to be read beside the claim's
@@ -46,7 +46,7 @@ class Finding:
 
 
 def verdict(finding, departs="", original=None):
-    """Whether a claim holds; where it does not, why, in the same line.
+    """The verdict on a claim in one line: it holds, or not and the reason.
 
     departs: "setting" or "start", in which a run differs from the paper's; "" where it does not
     original: the finding about the same claim in the paper's own setting, if it was run

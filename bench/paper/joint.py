@@ -1,4 +1,4 @@
-"""Section 6 of the paper: galaxies of blended scenes, fitted to either survey alone and to both.
+"""Section 6 of the paper: galaxies of blended scenes, fitted to each survey and to both.
 
     python -m bench.paper.joint [--scenes N] [--folder FOLDER]
 
@@ -30,7 +30,7 @@ CHUNK = 8  # scenes fitted side by side and logged together: some seconds
 
 
 def measure(folder, seeds):
-    """What the log keeps of some scenes: magnitudes and SDRs of their galaxies, one list each.
+    """Entry of the log for some scenes: magnitudes and SDRs of their galaxies, one list each.
 
     A mode's SDRs are null where its fit failed.
     """
@@ -64,7 +64,7 @@ def _profiles(scene):
 
 
 def run_scenes(options, log):
-    """Fit the scenes that the log lacks, in several processes, each on one thread."""
+    """Fits the scenes that the log lacks, in several processes, each on one thread."""
     missing = [seed for seed in range(options.scenes) if (seed,) not in log.done]
     tasks = [(options.catalogue, chunk) for chunk in in_chunks(missing, CHUNK)]
     there = options.scenes - len(missing)
@@ -83,7 +83,7 @@ def collect(log):
 
 
 def draw(folder, maps):
-    """Draw sdr_per_mag and single_vs_joint, and the errors of the second, for each start."""
+    """Draws sdr_per_mag and single_vs_joint, and the errors of the second, for each start."""
     edges = [f"{low:g}" for low in maps["edges"][:-1]]
     axes = {
         "rows": edges,

@@ -1,4 +1,4 @@
-"""What the joint fits say about section 6."""
+"""Findings of the joint fits about section 6."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _head_start(start, starts):
 
 
 def _gains(start, found):
-    """Where joint modelling gains over the better survey alone, and where it does not."""
+    """Regions in which joint modelling gains over the better survey alone, and the others."""
     groups = {"gains": [], "makes no certain difference": [], "loses": []}
     table = [["mean SDR [dB]", "galaxies", *map(str.capitalize, MODES), "joint minus the better"]]
     for name, region in found["regions"].items():

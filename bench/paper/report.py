@@ -121,7 +121,7 @@ class _Entry:
 
 
 def save(folder, name, record, **numbers):
-    """Write FOLDER/NAME.json, the record and the numbers, and print what they say."""
+    """Writes FOLDER/NAME.json, the record and the numbers, and prints the findings."""
     path = folder / f"{name}.json"
     records.write_json(path, {"record": record, **numbers})
     for entry in _entries({name: records.read_json(path)}):

@@ -1,4 +1,4 @@
-"""Elliptical Sersic profiles fitted to images of galaxies: where the paper starts its morphologies.
+"""Elliptical Sersic profiles fitted to images of galaxies, the paper's starting morphologies.
 
     S(x) = exp(-q^(1 / 2n) / 2),   q = (x - c)^T C^-1 (x - c)
 

@@ -1,4 +1,4 @@
-"""What a timing run says about section 4."""
+"""Findings of a timing run about section 4."""
 
 from __future__ import annotations
 

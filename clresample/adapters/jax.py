@@ -13,8 +13,7 @@ def as_jax(op):
 
     Both directions run on the operator's OpenCL device, in a callback from JAX's CPU backend:
     arrays are copied through the host once each way. The operator is linear, so it is its own
-    forward
-    derivative, and its adjoint is the reverse derivative: `jax.jvp`, `jax.vjp`, `jax.grad`,
+    forward derivative, and its adjoint is the reverse derivative: `jax.jvp`, `jax.vjp`, `jax.grad`,
     `jax.linear_transpose` and second derivatives are exact. `jax.vmap` makes one launch of a batch.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out

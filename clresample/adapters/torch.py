@@ -11,8 +11,8 @@ def as_torch(op):
 
     Both directions run on the operator's OpenCL device. Tensors are copied through the host once
     each way, so they should be on torch's CPU (others are copied there and back). Derivatives of
-    any order
-    are exact: the backward pass is the adjoint, and the backward pass of that is the operator.
+    any order are exact: the backward pass is the adjoint, and the backward pass of that is the
+    operator.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
     returns f(x): x (...,) + shape_in -> (...,) + shape_out, tensors of x's dtype and device; of one

@@ -73,7 +73,7 @@ class Blend:
     def initial_shifts(self) -> np.ndarray:
         """Shifts (n_observations, 2) [model px], 0 where none are given.
 
-        ValueError: they are not as many, or not finite.
+        Raises ValueError for another shape, and for shifts that are not finite.
         """
         expected = len(self.observations), 2
         shifts = (
@@ -84,9 +84,10 @@ class Blend:
         return shifts
 
     def resolve_frame(self) -> Frame:
-        """The frame, or one made for the observations, which are checked on the way.
+        """The frame of the blend, checked; if it has none, a `model_frame` of the observations.
 
-        ValueError: observations that do not go together, a profile of another shape than the frame.
+        Raises ValueError for observations that do not fit together, and for a profile of another
+        shape than the frame.
         """
         self.check()
         if self.frame is None:

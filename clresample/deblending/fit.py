@@ -36,10 +36,10 @@ class Fit:
     fitted (n,): indices of those inside the frame; undetected (n_dark,): of those far from any
         light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
-    noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
+    noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: these units
     ties: Ties of the channels, or None
     padded: the frame with its sides grown to those that a batch shares; geometry: SceneGeometry
-    last_steps (n_observations, 2) [model px]: the last steps of the shifts, before `ahead`
+    last_steps (n_observations, 2) [model px]: last steps of the shifts, before `extrapolate`
     start: the StartingPoint passed to `begin`, which sets the following
     scene, state: Scene and State at the start, later those of `end`
     strength_estimates: those of a MultiscalePrior, or None; losses, status, messages, seconds: see

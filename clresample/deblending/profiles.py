@@ -26,9 +26,9 @@ N_OTFS = 8
 # 0.25" (half-light radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; round,
 # with a scatter of 0.17 per component; wings between exponential and Gaussian, nearer to the
 # latter. Real galaxies are less round, 0.26 (Leauthaud et al. 2007). With that scatter, and wings
-# of 5, models of
-# faint galaxies follow the noise: median SDRs of simulated COSMOS galaxies, 0.22" wide or more, are
-# 0.1 to 0.3 dB lower in Euclid's or Rubin's images alone. Without that smoothing they are equal.
+# of 5, models of faint galaxies follow the noise: median SDRs of simulated COSMOS galaxies, 0.22"
+# wide or more, are 0.1 to 0.3 dB lower in Euclid's or Rubin's images alone. Without that smoothing
+# they are equal.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.17
 WINGS, WINGS_SCATTER = 6.5, 0.7

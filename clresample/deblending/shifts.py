@@ -21,7 +21,7 @@ SCATTER_PX = 2.0
 
 
 def shift_steps(scene, state) -> tuple[np.ndarray, float]:
-    """Steps of the observations (n_observations, 2) [model px], the first at rest, and their gain.
+    """Steps of the observations (n_observations, 2) [model px], 0 for the first, and their gain.
 
     The gain is the decrease of half of chi2, to second order, if the model fits the first
     observation.

@@ -120,8 +120,8 @@ class Device:
     def upload(self, values, array, *, wait=True):
         """Overwrites a device array with a C-contiguous NumPy array of its size and dtype.
 
-        wait: False only queues it; returns the event, which keeps the values until it is done:
-            hold it up to the next wait, since dropping it waits
+        wait: if False, the copy is queued and its event returned. The event owns the values: keep
+            it up to the next wait, because deleting it waits for the copy
         """
         return _copy(self, array.base_data, values, wait=wait, dst_offset=array.offset)
 
@@ -178,7 +178,8 @@ class Device:
         dtype: float32 or float64, which REAL stands for
         local_size: work-items of a group along each axis; None leaves it to the driver
         defines: macros; True defines the bare name, False and None leave it out
-        DeviceError: the file does not build here (with the compiler's log), or no float64
+        Raises DeviceError, with the compiler's log, if the file does not build on the device, or
+        without float64.
         """
         kernel, is_buffer = self._programs.kernel(file, name, dtype, defines)
         return Launcher(self, kernel, is_buffer, self._lock, local_size)

@@ -64,7 +64,7 @@ class DeviceInfo:
 
 
 def list_devices(choice=None):
-    """Every OpenCL device as a DeviceInfo, the one `get_device(choice)` would take marked."""
+    """Every OpenCL device as a DeviceInfo; `chosen` marks the one of `get_device(choice)`."""
     found = find_devices()
     try:
         chosen = choose(choice)

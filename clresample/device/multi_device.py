@@ -146,7 +146,7 @@ def distribute(function, items, devices, *, done, most):
     returns a list of results; None for an item that was not computed because of Ctrl-C
     Portions are sized by measured speed. If a device cannot be opened, or its process dies or
     raises, a DeviceWarning names it and its portion goes to the others.
-    ValueError: there are no devices; DeviceError: nothing fits a choice, or all devices have failed
+    Raises ValueError without devices; DeviceError if nothing fits a choice, or all devices failed.
     """
     if not devices:
         raise ValueError("device is an empty list, must name at least one")

@@ -62,7 +62,7 @@ def signature(file, name):
     """The arguments of kernel `name` in kernels/`file`: ((name, type), ...) in their order.
 
     type: of SCALARS, "REAL", or None for a buffer
-    ValueError: there is no such kernel, or an argument has another type
+    Raises ValueError if there is no such kernel, or an argument has another type.
     """
     text = re.sub(r"/\*.*?\*/", " ", read_kernel(file), flags=re.DOTALL)
     found = re.search(rf"__kernel\b[^;{{]*?\bvoid\s+{name}\s*\((.*?)\)\s*\{{", text, re.DOTALL)
@@ -89,8 +89,8 @@ class Programs:
     def kernel(self, file, name, dtype, defines):
         """A pyopencl.Kernel with its scalars' types, and {argument: True for a buffer}.
 
-        DeviceError: the file does not build here (with the compiler's log), or no float64
-        ValueError: dtype is another, or the file has no such kernel
+        Raises DeviceError, with the compiler's log, if the file does not build on the device, or
+        without float64; ValueError for another dtype, or if the file has no such kernel.
         """
         dtype = np.dtype(dtype)
         if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):

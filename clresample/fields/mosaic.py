@@ -223,7 +223,7 @@ class Mosaic:
         return Box.around(there).grown(1).intersection(Box.of(self.grid.shape))
 
     def edge_of(self, grid) -> np.ndarray:
-        """Points (n, 2) [px] along the outer edge of a grid, those that this mosaic has."""
+        """Points (n, 2) [px] along the outer edge of a grid that lie in the mosaic's projection."""
         there = grid.positions_in(self.grid, *outline(grid.shape))
         return there[np.isfinite(there).all(axis=-1)]
 

@@ -81,7 +81,7 @@ class FieldOptions:
 
     @property
     def devices(self) -> tuple:
-        """The choices of devices; empty where none was made."""
+        """The choices of devices; empty if there are none."""
         if isinstance(self.device, (list, tuple)):
             return tuple(self.device)
         return () if self.device is None else (self.device,)
@@ -109,7 +109,7 @@ class RunProgress:
         LOG.info("%s: %d to do", name, total)
 
     def step(self, n, sources=0):
-        """Some of it is done."""
+        """Reports that n more tiles or blends of the stage are done, with so many sources."""
 
     def message(self, text):
         """Receives a message for the user, one line."""

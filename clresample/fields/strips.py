@@ -18,8 +18,7 @@ from ..files.atomic import FileError
 STRIP_PX = 64
 # [bytes] Limit for all strips. A field of 4096 pixels a side, with six bands in pixels twice as
 # large and the errors of all, has 350 MB, and the blends of a group lie all over the field. With 64
-# MB each
-# blend decoded its rows again: 7.6 GB in all, at 160 MB a second a fifth of a run's time.
+# MB each blend decoded its rows again: 7.6 GB in all, at 160 MB a second a fifth of a run's time.
 MAX_BYTES = 384 << 20
 # Largest fraction of a process's memory limit for all strips.
 PART = 0.1

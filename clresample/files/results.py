@@ -59,11 +59,10 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, OUTSIDEBOX, FLUXBIAS,
     MOMENTBIAS, RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see
-    draws.py),
-    MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other programs:
-    CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per observation MODEL
-    and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat sky is put at
-    RA = Dec = 0. For NaN and infinity see array_hdus.py.
+    draws.py), MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other
+    programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per
+    observation MODEL and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat
+    sky is put at RA = Dec = 0. For NaN and infinity see array_hdus.py.
 
     path: of the file; result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header

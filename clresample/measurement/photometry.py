@@ -16,9 +16,8 @@ def fluxes(result):
 
     over the components i of s and j of t: with morphologies fixed. If the result has Errors, the
     covariances are theirs, marginalised over morphologies. |S| then includes the light of the
-    smooth
-    profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The bias
-    of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
+    smooth profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The
+    bias of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
     `Errors.flux_bound_bias`; so F can be negative.
 
     result: a fitted blend

@@ -12,7 +12,8 @@ def moments(components, light, beyond=None):
 
     components (k): with `origin` and `morphology`; light (k,): weight of each in I, in its box, in
         any unit; without any light, components have equal weights
-    beyond (k, 6): sums over the light of each beyond its box, see Errors.beyond; None = none
+    beyond (k, 6): sums over the light of each beyond its box, see Errors.outside_box_moments;
+        None = none
     returns c (2,) [px] and Q (2, 2) [px^2], rows and columns (y, x); NaN where every morphology is
         zero, or the light no number
     """

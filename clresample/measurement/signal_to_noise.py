@@ -184,8 +184,7 @@ def combine_bands(signals) -> tuple[np.ndarray, np.ndarray]:
         channels. One is the sum of the first image, best for sources visible in all channels. The
         other is the sum of the squares of positive values, best for unknown spectra, such as very
         red or very blue ones. Both have a normal distribution for noise. Their maximum reaches 5 in
-        noise six
-        times as often as a single one: once in 3e5 resolution elements
+        noise six times as often as a single one: once in 3e5 resolution elements
     """
     n_seen = sum(s.n_seen for s in signals)
     root = np.sqrt(np.maximum(n_seen, 1))

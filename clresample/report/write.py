@@ -56,9 +56,9 @@ def write_report(folder, path=None, *, truth=None, most_bytes=MAX_BYTES, overwri
     path: of the page; None = report.html in the folder, which is replaced
     truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
         truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
-    most_bytes: of the page. What does not fit is left out: the finest tiles; pictures of sources
-        after those that failed, misfit, or have the highest signal to noise; of more than some
-        90,000 sources (of four channels, by default) the faintest
+    most_bytes: limit on the page. To stay below it, the page omits the finest tiles; pictures of
+        sources, first of those without failure or misfit and with the lowest signal to noise; and
+        the faintest sources, by default of more than about 90,000 with four channels
     overwrite: replace the file at `path`
 
     Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and

@@ -75,7 +75,10 @@ class Box(NamedTuple):
 
     @classmethod
     def around(cls, points) -> Box:
-        """The pixels that points (..., 2) [px], (y, x), touch. ValueError: one is not finite."""
+        """Box of the pixels that points (..., 2) [px], (y, x), touch.
+
+        Raises ValueError for points that are not finite.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if not np.isfinite(points).all():
             raise ValueError("points has some that are not finite")

@@ -56,10 +56,9 @@ class Frame:
         """Selects positions (..., 2) [px] on a pixel of the frame: -1/2 <= x < N - 1/2.
 
         A position on the edge of a pixel belongs to pixel floor(x + 1/2). A fit omits a source
-        outside
-        the frame, with a warning: its centre, from which morphologies decrease, is not in the
-        frame, nor is most of its light. A source inside is fitted, however near to the edge, with
-        the part of its light that falls on the frame.
+        outside the frame, with a warning: its centre, from which morphologies decrease, is not in
+        the frame, nor is most of its light. A source inside is fitted, however near to the edge,
+        with the part of its light that falls on the frame.
 
         returns (...) bool; False for NaN
         """
@@ -77,10 +76,10 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         no more than the frame has pixels along a side
     shared: cover the intersection of the observations' footprints instead of their union
 
-    Footprints are bounding boxes along the frame's axes. The union includes the corners of a
-    rotated observation, so parts of the frame, or of an intersection, may be covered by no
-    observation. Observed pixels outside the frame have no model and must get weight 0
-    (`Resampler.covered`).
+    Footprints are bounding boxes along the frame's axes. The box of a rotated observation has
+    corners that the observation does not cover, so that some pixels of the frame may be covered by
+    no observation, also if `shared`. Observed pixels outside the frame have no model and must get
+    weight 0 (`Resampler.covered`).
 
     Raises ValueError if only one of grid and observations has a WCS, if an observation does not
     overlap the others or the frame, and as `check_observations` does.
@@ -110,7 +109,8 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
             )
     if psf_sigma_px > max(grid.shape):
         raise ValueError(
-            f"psf_sigma_px is {psf_sigma_px:g}: no more than the model frame's {grid.shape} pixels"
+            f"psf_sigma_px is {psf_sigma_px:g} px, must be at most the longer side of the model "
+            f"frame {grid.shape}"
         )
     return Frame(grid, model_psf(float(psf_sigma_px)))
 
@@ -124,7 +124,7 @@ def model_psf(sigma_px=0.8):
 
 
 def _check_connected(observations, like):
-    """Every observation overlaps another, and no group of them stands apart: one patch of sky."""
+    """Raises ValueError unless overlaps connect all observations, directly or through others."""
     near, far = [observations[0]], list(observations[1:])
     while far:
         met = [o for o in far if any(bounding_boxes_overlap(o.grid, n.grid, like) for n in near)]

@@ -103,7 +103,7 @@ class Grid(GridDisplay, ABC):
     @property
     @abstractmethod
     def pixel_scale_arcsec(self) -> float:
-        """Root of the central pixel's area [arcsec]."""
+        """Square root of the central pixel's area [arcsec]."""
 
     @abstractmethod
     def sky(self, n, m) -> np.ndarray:
@@ -258,7 +258,7 @@ class WcsGrid(Grid):
 
     @property
     def pixel_scale_arcsec(self):
-        """Root of the central pixel's area [arcsec], from the WCS evaluated around it."""
+        """Square root of the central pixel's area [arcsec], from the WCS evaluated around it."""
         return pixel_scale(self.wcs, *(np.array(self.shape) - 1) / 2)
 
     def sky(self, n, m):

@@ -71,7 +71,7 @@ class Source:
 
         observations: among which `observation` is looked up
         shifts (n_observations, 2) [model px]: of their pixels, None = none
-        ValueError: `observation` names none of them, or more than one
+        Raises ValueError if `observation` names none of them, or more than one.
         """
         if self.sky_deg is not None:
             a, b = self.sky_deg
@@ -87,9 +87,9 @@ class Source:
         return position if shifts is None else position + shifts[i]
 
     def on_frame(self, position) -> Source:
-        """This source with its position (2,) [px] in the model frame, if an observation's it was.
+        """This source at a position (2,) [px] of the model frame, if it was one of an observation.
 
-        ValueError: the position is not finite: the frame's projection holds no such point.
+        Raises ValueError for a position that is not finite, outside the frame's projection.
         """
         if self.observation is None:
             return self

@@ -1,4 +1,4 @@
-"""What the paper's benchmarks say follows from their numbers: sentences, verdicts, reasons."""
+"""Findings of the paper's benchmarks follow from their numbers: sentences, verdicts, reasons."""
 
 import numpy as np
 import pytest

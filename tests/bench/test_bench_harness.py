@@ -1,4 +1,4 @@
-"""What the benchmarks share: files that are whole or absent, logs that a later run goes on from."""
+"""The benchmarks' common code: files whole or absent, logs that a later run continues."""
 
 import json
 import math

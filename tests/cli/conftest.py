@@ -24,6 +24,6 @@ def scene(tmp_path):
 
 @pytest.fixture
 def double():
-    """Skip a test where the device that the command takes has no double precision."""
+    """Skips a test where the device that the command takes has no double precision."""
     if not get_device().has_fp64:
         pytest.skip(f"{get_device().name} has no double precision")

@@ -25,7 +25,7 @@ def example(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def output(example):
-    """What a run on the example writes."""
+    """The outputs of a run on the example."""
     assert deblend(example / "scene.toml", example / "out", "--max-iter", "20") == 0
     return example / "out"
 

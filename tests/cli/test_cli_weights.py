@@ -8,7 +8,7 @@ from helpers.tiny_scene import OF_FIT, change, deblend
 
 
 def finite(folder):
-    """Assert that the outputs are all there and hold finite numbers in every image."""
+    """Asserts that the outputs are all there and hold finite numbers in every image."""
     assert {p.name for p in folder.iterdir()} == OF_FIT
     with fits.open(folder / "result.fits") as hdus:
         for hdu in hdus:

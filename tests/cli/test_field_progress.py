@@ -1,4 +1,4 @@
-"""What `clresample field` shows while it runs: on a terminal, in a log, and nothing if quiet."""
+"""Progress of `clresample field`: on a terminal, in a log, and none if quiet."""
 
 import io
 import re

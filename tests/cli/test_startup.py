@@ -1,4 +1,4 @@
-"""What a command waits for: the modules that it imports, read off after it ran."""
+"""Start of a command: the modules that it imports, listed after it ran."""
 
 import pytest
 from helpers.checkout import run_python

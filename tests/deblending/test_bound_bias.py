@@ -1,4 +1,4 @@
-"""What the bound at 0 holds back and chi2 where light is: finite differences, many noises."""
+"""Bias by the bound at 0, and chi2 in light: finite differences, many noises."""
 
 from types import SimpleNamespace
 
@@ -48,7 +48,7 @@ def test_pulls_are_slopes_of_chi2(n_terms):
     root, data = rng.uniform(1, 2, (2, 4, 4)), rng.normal(size=(2, 4, 4))
 
     def image(i, morph):
-        """What the observation sees of component i (2, 4, 4), each channel on its own."""
+        """Images of component i in the observation (2, 4, 4), each channel on its own."""
         (y, x), (n_y, n_x) = origin[i], morph.shape
         parts = np.ones((2, 1)) if shares is None else shares[source[i]]
         seen = np.zeros((2, 4, 4))

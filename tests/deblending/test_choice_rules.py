@@ -1,4 +1,4 @@
-"""How sources are rendered: groups by cells, counted operations, windows where they save."""
+"""Methods of rendering sources: groups by cells, counted operations, windows that save."""
 
 from types import SimpleNamespace
 

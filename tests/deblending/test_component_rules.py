@@ -1,4 +1,4 @@
-"""Who is asked for a second component, and what it must gain, on fits made by hand."""
+"""Tests for a second component, and the gain that they require, on fits made by hand."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What a fit makes of awkward sources and awkward data."""
+"""Fits of awkward sources and awkward data."""
 
 import numpy as np
 import pytest

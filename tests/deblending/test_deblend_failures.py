@@ -68,7 +68,7 @@ def _refuse(failed):
 
 
 def test_failures_of_the_device_and_of_results(device, monkeypatch):
-    """What a whole group cannot do is done one by one; a result that fails is one failure."""
+    """Fits of a group that fails are done one by one; a failed result is one failure."""
     blends = [blend(seed=i) for i in range(4)]
     original, result = Engine.__init__, Fit.result
 

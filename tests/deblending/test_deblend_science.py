@@ -1,4 +1,4 @@
-"""What a fit is for: honest flux errors, galaxies near their truth, whatever the pixels' angle."""
+"""Purpose of a fit: correct flux errors, galaxies near their truth, at any angle of the pixels."""
 
 import math
 

@@ -65,15 +65,6 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
     return many, group, calls
 
 
-def test_scenes_are_fitted_in_parts_that_fit_into_the_memory(monkeypatch):
-    """As many as there is room for; one that is too large goes alone."""
-    given = {"a": 40, "b": 60, "c": 41, "d": 300, "e": 10}
-    many, group, _ = many_of("abcde", monkeypatch, **given)
-    parts = [[fit.name for _, fit in part] for part in many._parts(group)]
-    assert parts == [["a", "b"], ["c"], ["d"], ["e"]]
-    assert list(many._parts([])) == []
-
-
 def test_those_that_can_begin_though_others_cannot(monkeypatch):
     many, group, _ = many_of(["a", "bad", "dim"], monkeypatch)
     begun = many._begin(group)

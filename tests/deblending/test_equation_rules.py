@@ -184,9 +184,11 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
 @pytest.mark.parametrize("size", [1.0, 1e-3])
 @pytest.mark.parametrize("fit_sky", [False, True])
 def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky, size):
-    """What a step of the parameters changes once lit spectra and sky levels have followed it;
-    slopes that a component does not have say nothing. Images of unit integral are far smaller than
-    a level of 1, whose curvature is no measure of theirs."""
+    """Changes by a step of the parameters after lit spectra and sky levels have followed it.
+
+    Slopes that a component does not have are 0. Images of unit integral are far smaller than a
+    level of 1, whose curvature is no measure of theirs.
+    """
     one, rng, error = posed(fit_sky), np.random.default_rng(6), 0.1
     for sight in one.sights:
         sight.images *= size

@@ -1,4 +1,4 @@
-"""What errors are made of: pixels along the model's axes, and sums over modes and spectra."""
+"""Parts of errors: pixels along the model's axes, and sums over modes and spectra."""
 
 from dataclasses import replace
 from types import SimpleNamespace

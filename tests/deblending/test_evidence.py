@@ -24,7 +24,7 @@ def disk(n=41, size=5.0):
 
 
 def answers(sigmas=(1.0, 2.0), shape=(80, 90), pixel=(40, 45)):
-    """What blurs of these sigmas [px], back and forth, make of one pixel."""
+    """Image of one pixel after blurs of these sigmas [px], and their transposes."""
     out = []
     for sigma in sigmas:
         y = gaussian(np.sqrt(2) * sigma, 30, unit_sum=True)

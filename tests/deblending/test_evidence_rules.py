@@ -25,60 +25,60 @@ def test_values_are_shared_between_the_levels_about_them():
     assert found.sum() == pytest.approx(50) and found @ levels == pytest.approx(values.sum())
 
 
+PRIOR = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
+SPECTRUM, OLD, ENERGIES = np.array([2.0]), np.array([0.05, 0.1]), np.array([0.3, 0.5])
+
+
 def evidence(prior, *, level):
-    """Of a round profile on 15 x 17 pixels, seen alike at all frequencies."""
+    """SourceEvidence of a round profile on 15 x 17 pixels, with one response at all frequencies."""
     spectra = LocalPowerSpectra(prior)
     y, x = np.indices((15, 17))
     profile = np.exp(-np.hypot(y - 7, x - 8) / 3)
     return SourceEvidence(spectra, prior, profile, np.full((1, len(spectra.weight)), level))
 
 
-def test_new_strengths_are_the_fixed_point_of_the_evidence():
-    """Of what is well seen, energies over determined numbers; within 4 of the old, 0.1 % to 100 %;
-    misfit makes energies smaller, and never larger."""
-    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
-    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    seen, gamma = one.resolved_fraction(spectrum), one.determined(old, spectrum)
-    assert (seen > 0.9).all() and (gamma > 5).all()
-    m, energies = 10 / seen**2, np.array([0.3, 0.5])
-    for chi2 in (0.2, 1.0, 3.0):
-        wanted = np.sqrt((energies / max(chi2, 1) + m * [0.02**2, 0.1**2]) / (gamma + m))
-        assert ((wanted > old / 4) & (wanted < 4 * old)).all()
-        np.testing.assert_allclose(one.learned(old, energies, spectrum, chi2), wanted)
-    np.testing.assert_allclose(one.learned(old, 1e9 * energies, spectrum, 1.0), 4 * old)
-    np.testing.assert_allclose(
-        one.learned(np.array([1e-3, 0.5]), np.array([0.0, 1e9]), spectrum, 1.0)[1], 1.0
-    )
-    tiny = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), hyperprior_weight=10.0)
-    found = evidence(tiny, level=1e4).learned(np.full(2, 2e-3), np.zeros(2), spectrum, 1.0)
-    np.testing.assert_allclose(found, 1e-3)
+BRIGHT = evidence(PRIOR, level=1e4)
 
 
-def test_structure_is_clear_where_the_finest_scale_holds_more_than_the_data_determine():
-    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
-    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    gamma = one.determined(old, spectrum)[0]
-    assert gamma > 0.2 * MIN_SIGNIFICANCE  # else the test could not tell one from the other
-    for energy, clear in (
-        (gamma + MIN_SIGNIFICANCE + 0.01, True),
-        (gamma + MIN_SIGNIFICANCE - 0.01, False),
-    ):
-        energies = np.array([energy * old[0] ** 2, 0.0])
-        assert one.is_clear(old, energies, spectrum) == clear
-    assert not one.is_clear(old, np.array([0.0, 1e9]), spectrum)  # at the finest scale alone
-
-
-def test_clear_structure_follows_the_data():
-    """At the finest scale, with a tenth of the weight and whatever the misfit; not at others."""
-    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
-    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    m = np.array([1, 10]) / one.resolved_fraction(spectrum) ** 2
-    energies, misfit = np.array([0.3, 0.5]), np.array([1.0, 3.0])
-    wanted = energies / misfit + m * np.square(prior.strengths)
-    wanted = np.sqrt(wanted / (one.determined(old, spectrum) + m))
-    found = one.learned(old, energies, spectrum, 3.0, clear=True)
+@pytest.mark.parametrize("chi2", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("clear", [False, True])
+def test_new_strengths_are_the_fixed_point_of_the_evidence(chi2, clear):
+    """Energies over determined numbers. Misfit makes energies smaller, never larger. Significant
+    structure at the finest scale has a tenth of the prior's weight there, and ignores misfit."""
+    resolved, gamma = BRIGHT.resolved_fraction(SPECTRUM), BRIGHT.determined(OLD, SPECTRUM)
+    assert (resolved > 0.9).all() and (gamma > 5).all()
+    m = np.array([1 if clear else 10, 10]) / resolved**2
+    misfit = np.array([1 if clear else max(chi2, 1), max(chi2, 1)])
+    wanted = np.sqrt((ENERGIES / misfit + m * np.square(PRIOR.strengths)) / (gamma + m))
+    assert ((wanted > OLD / 4) & (wanted < 4 * OLD)).all()
+    found = BRIGHT.learned(OLD, ENERGIES, SPECTRUM, chi2, clear=clear)
     np.testing.assert_allclose(found, wanted)
-    assert found[0] > 1.2 * one.learned(old, energies, spectrum, 3.0)[0]
+    if clear and chi2 > 1:
+        assert found[0] > 1.2 * BRIGHT.learned(OLD, ENERGIES, SPECTRUM, chi2)[0]
+
+
+@pytest.mark.parametrize(
+    "strengths, old, energies, wanted",
+    [
+        ((0.02, 0.1), OLD, 1e9 * ENERGIES, 4 * OLD),
+        ((0.02, 0.1), np.array([1e-3, 0.5]), np.array([1e9, 1e9]), [4e-3, 1.0]),
+        ((1e-6, 1e-6), np.full(2, 2e-3), np.zeros(2), [1e-3, 1e-3]),
+    ],
+)
+def test_new_strengths_are_limited(strengths, old, energies, wanted):
+    """Within a factor of 4 of the old ones, and 0.1 % to 100 %."""
+    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=strengths, hyperprior_weight=10.0)
+    found = evidence(prior, level=1e4).learned(old, energies, SPECTRUM, 1.0)
+    np.testing.assert_allclose(found, wanted)
+
+
+@pytest.mark.parametrize("excess, clear", [(0.01, True), (-0.01, False)])
+def test_structure_is_significant_beyond_the_number_that_the_data_determine(excess, clear):
+    gamma = BRIGHT.determined(OLD, SPECTRUM)[0]
+    assert gamma > 0.2 * MIN_SIGNIFICANCE  # else the test could not tell one from the other
+    energies = np.array([(gamma + MIN_SIGNIFICANCE + excess) * OLD[0] ** 2, 0.0])
+    assert BRIGHT.is_clear(OLD, energies, SPECTRUM) == clear
+    assert not BRIGHT.is_clear(OLD, np.array([0.0, 1e9]), SPECTRUM)  # at the finest scale alone
 
 
 def test_what_is_not_seen_stays_as_it_was_expected():

@@ -37,7 +37,7 @@ def raised(blend, by):
 
 
 def expecting(monkeypatch, levels, error):
-    """Let inspections find these levels (3,) with this error [counts]."""
+    """Lets inspections find these levels (3,) with this error [counts]."""
     parts = {"v": np.array(levels[:1]), "g": np.array(levels[1:])}
 
     def found(image):

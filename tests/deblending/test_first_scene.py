@@ -83,7 +83,7 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
 
 
 def test_spectra_step_by_their_error_and_a_fiftieth_of_themselves(monkeypatch):
-    """Where the channel holds nothing of a component they stay."""
+    """Spectra stay in channels in which a component has no light."""
     monkeypatch.setattr(steps, "damping", lambda *given: given)
     first = first_scene(posed(monkeypatch)[0])
     scene, state = steps.begin_steps(*first, "prior")

@@ -1,4 +1,4 @@
-"""What a fit leaves behind, of a state made by hand: maxima of 1, units, what is not covered."""
+"""Results of a state made by hand: maxima of 1, units, uncovered channels."""
 
 from dataclasses import replace
 from types import SimpleNamespace

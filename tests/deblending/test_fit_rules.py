@@ -1,4 +1,4 @@
-"""Rules of a fit on its way, each alone: when it ends, what shares a group, what is too much."""
+"""Rules of fits, in tables: their ends, groups and parts, failures, and limits of one fit."""
 
 import contextlib
 from types import SimpleNamespace
@@ -17,21 +17,21 @@ from clresample.deblending.solver.scene import Scene
 from clresample.paper.run import DIVERGENCE_RATIO, PATIENCE, stop_reason
 from clresample.sky.sources import ExtendedSource, SourceWarning
 
+FLAT = [100.0] * 16
 
-def test_when_a_fit_ends():
-    """After fifteen iterations in which the best loss fell by less than the part; ten times the
-    best one is a divergence, as is NaN among the new losses alone."""
+
+@pytest.mark.parametrize(
+    "reason, runs",
+    [
+        (None, [(FLAT[:15], 5), ([100.0, *[99.89] * 15], 5), ([1.0, 9.9], 1), ([np.nan, 1, 1], 2)]),
+        ("converged", [(FLAT, 5), ([100.0, *[99.91] * 15], 5), ([50.0, *FLAT], 5)]),
+        ("diverged", [([1.0, 10.1], 1), ([1.0, np.nan, 1.0], 2), ([1.0, np.inf], 1)]),
+    ],
+)
+def test_a_fit_ends_after_fifteen_flat_iterations_or_at_ten_times_its_best_loss(reason, runs):
+    """NaN is a divergence among the new losses alone."""
     assert (PATIENCE, DIVERGENCE_RATIO) == (15, 10)
-    flat = [100.0] * 16
-    assert stop_reason(flat[:15], 5, 1e-3) is None and stop_reason(flat, 5, 1e-3) == "converged"
-    assert stop_reason([100.0] + [99.91] * 15, 5, 1e-3) == "converged"
-    assert stop_reason([100.0] + [99.89] * 15, 5, 1e-3) is None
-    assert stop_reason([50.0] + flat, 5, 1e-3) == "converged"  # it fell no further
-    assert stop_reason([1.0, 9.9], 1, 1e-3) is None
-    assert stop_reason([1.0, 10.1], 1, 1e-3) == "diverged"
-    assert stop_reason([np.nan, 1.0, 1.0], 2, 1e-3) is None
-    assert stop_reason([1.0, np.nan, 1.0], 2, 1e-3) == "diverged"
-    assert stop_reason([1.0, np.inf], 1, 1e-3) == "diverged"
+    assert [stop_reason(losses, n_new, 1e-3) for losses, n_new in runs] == [reason] * len(runs)
 
 
 def test_sources_outside_the_frame_are_named():
@@ -73,13 +73,17 @@ def test_frames_are_padded_to_multiples():
     np.testing.assert_allclose(padded.grid.sky(3, 4), home.grid.sky(3, 4), atol=1e-12)
 
 
-def test_memory_of_a_fits_images():
-    """Two of the model and four of the observation for each band, of 8 bytes."""
-    ops = [
-        SimpleNamespace(op=SimpleNamespace(shape_in=(c, 10, 12), shape_out=(c, 5, 7)))
-        for c in (1, 3)
-    ]
-    assert data_bytes(SimpleNamespace(views=ops)) == 8 * 4 * (2 * 120 + 4 * 35)
+def test_memory_of_fits_and_scenes():
+    """Of 8 bytes a number: two images of the model and four of the observation for each band or
+    channel, twelve arrays a box of a scene."""
+    shapes = [((1, 10, 12), (1, 5, 7)), ((3, 10, 12), (3, 5, 7))]
+    ops = [SimpleNamespace(shape_in=inside, shape_out=out) for inside, out in shapes]
+    n_images = 8 * 4 * (2 * 120 + 4 * 35)
+    assert data_bytes(SimpleNamespace(views=[SimpleNamespace(op=op) for op in ops])) == n_images
+    one = SimpleNamespace(ops=ops, profile=[np.zeros((3, 3)), np.zeros((2, 5))])
+    assert Scene.n_bytes.fget(one) == n_images + 8 * 12 * 19
+    ops[0].shape_out = (2, 6, 7)
+    assert Scene.n_bytes.fget(one) == n_images + 8 * (12 * 19 + 4 * (2 * 42 - 35))
 
 
 def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None, n_scenes=50):
@@ -102,38 +106,32 @@ def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None,
     return list(many._groups())
 
 
-def test_memory_of_a_scene():
-    """Two models and four observed images a channel, twelve arrays a box, of eight bytes each."""
-    ops = [
-        SimpleNamespace(shape_in=(1, 4, 5), shape_out=(2, 3, 3)),
-        SimpleNamespace(shape_in=(2, 4, 5), shape_out=(2, 6, 7)),
-    ]
-    one = SimpleNamespace(ops=ops, profile=[np.zeros((3, 3)), np.zeros((2, 5))])
-    wanted = 8 * (2 * (20 + 40) + 4 * (18 + 84) + 12 * 19)
-    assert Scene.n_bytes.fget(one) == wanted
-
-
-def test_groups_fill_up():
+@pytest.mark.parametrize(
+    "n, given, groups",
+    [
+        (7, {"n_scenes": 3}, [[0, 1, 2], [3, 4, 5], [6]]),
+        (5, {"n_bytes": 250}, [[0, 1, 2, 3], [4]]),  # one more would be too much
+        (3, {"n_bytes": 251}, [[0, 1, 2]]),
+        (4, {"n_bytes": 334}, [[0, 1], [2, 3]]),
+        (3, {"n_bytes": 2000}, [[0], [1], [2]]),
+        (5, {"sources": 250}, [[0, 1], [2, 3], [4]]),
+        (4, {"sources": 249}, [[0, 1, 2], [3]]),
+        (7, {"sources": 3, "most": 9}, [[0, 1, 2], [3, 4, 5], [6]]),
+        (4, {"sources": 4, "most": 9}, [[0, 1], [2, 3]]),
+        (5, {"signatures": [0, 1, 0, 1, 0], "n_scenes": 2}, [[0, 2], [1, 3], [4]]),
+    ],
+)
+def test_groups_fill_up(n, given, groups, monkeypatch):
     """To the scenes of a batch, to the memory, to 500 sources; what is left comes at the end."""
-    with pytest.MonkeyPatch.context() as patch:
-        assert fits(7, patch, n_scenes=3) == [[0, 1, 2], [3, 4, 5], [6]]
-        assert fits(5, patch, n_bytes=250) == [[0, 1, 2, 3], [4]]  # one more would be too much
-        assert fits(3, patch, n_bytes=251) == [[0, 1, 2]]
-        assert fits(4, patch, n_bytes=334) == [[0, 1], [2, 3]]
-        assert fits(3, patch, n_bytes=2000) == [[0], [1], [2]]
-        assert fits(5, patch, sources=250) == [[0, 1], [2, 3], [4]]
-        assert fits(4, patch, sources=249) == [[0, 1, 2], [3]]
-        patch.setattr(batch, "MAX_SOURCES", 9)
-        assert fits(7, patch, sources=3) == [[0, 1, 2], [3, 4, 5], [6]]
-        assert fits(4, patch, sources=4) == [[0, 1], [2, 3]]
-        kinds = [0, 1, 0, 1, 0]
-        assert sorted(fits(5, patch, signatures=kinds, n_scenes=2)) == [[0, 2], [1, 3], [4]]
+    monkeypatch.setattr(batch, "MAX_SOURCES", given.pop("most", batch.MAX_SOURCES))
+    assert sorted(fits(n, monkeypatch, **given)) == groups
 
 
 @pytest.mark.parametrize(
     "sizes, parts",
     [
         ([40, 60, 1], [[40, 60], [1]]),
+        ([40, 60, 41, 300, 10], [[40, 60], [41], [300], [10]]),
         ([101, 5], [[101], [5]]),
         ([5, 101, 5], [[5], [101], [5]]),
         ([30, 30, 30, 30], [[30, 30, 30], [30]]),
@@ -141,7 +139,7 @@ def test_groups_fill_up():
     ],
 )
 def test_parts_fit_into_the_memory(monkeypatch, sizes, parts):
-    """Exactly the memory fits; what is larger by itself is tried by itself."""
+    """Exactly the memory fits; a scene that exceeds it goes alone."""
     monkeypatch.setattr(batch, "scene_bytes", lambda fit: fit)
     many = object.__new__(_BatchRunner)
     many.memory = 100
@@ -184,40 +182,41 @@ def test_blends_of_one_size_keep_it_and_others_share_one(monkeypatch):
     assert pads == [1, 1, 1, batch.PAD_PX, 1]
 
 
-def test_work_is_bounded_before_it_begins():
-    given = scenes.blend()
-    home = SimpleNamespace(shape=(4096, 4097))
-    with pytest.raises(ValueError, match=r"4096 x 4097 pixels, more than the 16777216 of one fit"):
-        given._check_work(home)
-    seen = [np.count_nonzero(o.weights[0]) for o in given.observations]
-    many = Blend(given.observations, (ExtendedSource(position_px=(3, 3)),) * (max(seen) + 1))
-    with pytest.raises(
-        ValueError, match=rf"{max(seen) + 1} components, but .* than {max(seen)} pixels"
-    ):
-        many._check_work(given.frame)
-    Blend(given.observations, many.sources[1:])._check_work(given.frame)
-    weights = np.zeros((2, 60, 60))
-    weights[1] = 1  # one channel sees enough
-    half = SimpleNamespace(weights=weights, data=weights)
-    Blend((half,), many.sources)._check_work(given.frame)
-    dot = np.zeros((1, 60, 60))
-    one = SimpleNamespace(weights=dot, data=dot)
-    Blend((one,), many.sources)._check_work(given.frame)  # nothing is seen: nothing is fitted
-    dot[0, 5, 6] = 1
-    with pytest.raises(ValueError, match=r"2 components, but .* than 1 pixels"):
-        Blend((one,), many.sources[:2])._check_work(given.frame)
-    two = ExtendedSource(position_px=(3, 3), n_components=2)
-    wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))
-    with pytest.raises(ValueError, match=r"1001 sources with 2002 components .* at most 2000 comp"):
-        Blend((wide,), (two,) * 1001)._check_work(given.frame)
-    Blend((wide,), (two,) * 1000)._check_work(given.frame)
-    large = SimpleNamespace(shape=(2048, 2048))  # 60 boxes of 256 x 256 at 40 bytes and so on
-    n_bytes = 40 * 1900 * 256**2 + 100 * (2048**2 + 3600)
-    assert n_bytes < 8 << 30
-    Blend((wide,), (two,) * 950)._check_work(large)
-    big = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 6000, 6000)))
-    gib = (40 * 1900 * 256**2 + 100 * (2048**2 + 36e6)) / 2**30
-    with pytest.raises(
-        ValueError, match=rf"need {gib:.3g} GiB in one fit, must be at most .* 8 GiB"
-    ):
-        Blend((big,), (two,) * 950)._check_work(large)
+def seen(n_pixels, *, beside=(), data=60):
+    """An observation of channels (60, 60) with so many pixels of weight in each."""
+    weights = np.zeros((1 + len(beside), 60, 60))
+    for channel, n in zip(weights, (n_pixels, *beside), strict=True):
+        channel.flat[:n] = 1
+    return SimpleNamespace(weights=weights, data=np.zeros((len(weights), data, data)))
+
+
+ONE = ExtendedSource(position_px=(3, 3))
+TWO = ExtendedSource(position_px=(3, 3), n_components=2)
+GIB = (40 * 1900 * 256**2 + 100 * (2048**2 + 36e6)) / 2**30  # of the last case; 60 px: under 8
+
+
+@pytest.mark.parametrize(
+    "observation, sources, side, words",
+    [
+        (seen(9), [ONE], (4096, 4097), "4096 x 4097 pixels, more than the 16777216 of one fit"),
+        (seen(9), [ONE], (4096, 4096), None),
+        (seen(270), [ONE] * 271, (30, 36), "271 components, but .* than 270 pixels"),
+        (seen(270), [ONE] * 270, (30, 36), None),
+        (seen(0, beside=[3600]), [ONE] * 271, (30, 36), None),  # one channel suffices
+        (seen(0), [ONE] * 271, (30, 36), None),  # nothing is fitted without data
+        (seen(1), [ONE] * 2, (30, 36), "2 components, but .* than 1 pixels"),
+        (seen(3600), [TWO] * 1001, (30, 36), "1001 sources with 2002 comp.* at most 2000 comp"),
+        (seen(3600), [TWO] * 1000, (30, 36), None),
+        (seen(3600), [TWO] * 950, (2048, 2048), None),
+        (
+            seen(3600, data=6000),
+            [TWO] * 950,
+            (2048, 2048),
+            rf"need {GIB:.3g} GiB in one fit, must be at most .* 8 GiB",
+        ),
+    ],
+)
+def test_work_is_bounded_before_it_begins(observation, sources, side, words):
+    one = Blend((observation,), tuple(sources))
+    with pytest.raises(ValueError, match=words) if words else contextlib.nullcontext():
+        one._check_work(SimpleNamespace(shape=side))

@@ -1,4 +1,4 @@
-"""What is wrong with observations is said before a fit, and cured where that is safe."""
+"""Problems of observations are reported before a fit, and mended where that is safe."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""What runs a batch of fits, with engines that only say what they are told: who stops, who is
-shifted, what is kept, who goes on."""
+"""The loop of a batch of fits, with scripted engines: stops, shifts, kept states."""
 
 from types import SimpleNamespace
 

@@ -73,7 +73,7 @@ def errors_of(result, sigma):
 
 
 def test_a_galaxys_profile_says_how_much_is_outside():
-    """Where it is the smaller estimate; not much less than there is, of such a galaxy."""
+    """If it is the smaller estimate; it is not much less than the true light of such a galaxy."""
     for sigma_px in (4.0, 8.0, 14.0):
         result, given, rest = galaxy(sigma_px)
         part = light_outside(result, *given)[0] / result.components[0].flux
@@ -109,7 +109,7 @@ def test_noise_at_the_edge_is_no_light_there():
 
 
 def test_copies_of_a_result_keep_what_was_derived_from_its_model():
-    """Where its pixels lie, what was not observed, and its misfit; nothing is derived for them."""
+    """Positions of its pixels, unobserved pixels, and its misfit; nothing is derived for them."""
     result = one_source()
     footprints, outside = result.footprints, result.unobserved
     copy = noted(result, status="misfit")

@@ -1,4 +1,4 @@
-"""What is expected of a scene's galaxies, learned from all of them."""
+"""The prior on a scene's galaxies, updated from all of them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where sources are: in the pixels of an observation, and where no image shows anything."""
+"""Positions of sources: in the pixels of an observation, and far from any light."""
 
 import warnings
 from dataclasses import replace

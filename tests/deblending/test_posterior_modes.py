@@ -1,4 +1,4 @@
-"""What a morphology may still be: bumps, slopes of profiles, moments; beside their definitions."""
+"""Modes of a morphology: bumps, slopes of profiles, moments; compared with their definitions."""
 
 import numpy as np
 import pytest

@@ -107,7 +107,7 @@ def test_what_bumps_change_counts_in_errors_of_flux_and_size():
 
 
 def test_modes_leave_the_spectrum_and_pixels_at_their_bound_alone():
-    """What lies along the profile is taken off; where a free morphology is 0 nothing changes."""
+    """The part along the profile is removed; pixels at a free morphology's bound do not change."""
     rng = np.random.default_rng(0)
     one = solution([(0, 0)] * 2, [spot(), spot()], fixed=(1,))
     for m in one.morphs:
@@ -217,7 +217,7 @@ def test_wings_are_followed_to_the_edge_of_the_frame(log_beta):
 
 
 def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():
-    """Where structure has made the peak of a source twice that of its profile."""
+    """Of a source whose structure has doubled the peak of its profile."""
     shape, theta, place = (
         GalaxyProfile(scenes.frame()),
         np.array([1.5, 0, 0, 0.5]),

@@ -115,7 +115,7 @@ def test_windows_are_put_together(queue, add, dtype):
 
 @every_type
 def test_windows_are_cut_out(queue, dtype):
-    """What lies beyond the pixels is 0; the transpose of putting them together."""
+    """Pixels beyond are 0; the transpose of assembling them."""
     n_bands, shape, size = 2, (18, 40), (9, 11)
     image, scene = random(3, n_bands, *shape), np.repeat([0, 2], [4, 5]).astype(np.int32)
     wanted = np.zeros((len(LOW), n_bands, *size))

@@ -20,10 +20,8 @@ from clresample.deblending.solver.multiscale.evidence import (
     LocalPowerSpectra,
     SourceEvidence,
 )
-from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
-from clresample.deblending.spectra import RIDGE, unit_diagonal
 from clresample.paper.settings import PaperSettings
 from clresample.sky.psf import PSF
 
@@ -70,16 +68,6 @@ def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
     assert pairs.count.tolist() == [1, 0, 0, 1]
 
 
-def test_only_scenes_that_learn_have_another_loss():
-    progress = LbfgsControl(3, 0.01, [100, 100, 100])
-    progress.loss[:] = [50.0, 60.0, 70.0]
-    progress.n_rounds[:] = 7
-    due = np.array([False, True, False])
-    progress.record_strengths(due, np.zeros(3), np.array([9.0, 4.0, np.nan]))
-    assert progress.loss.tolist() == [50, 64, 70]
-    assert progress.settled.tolist() == [False, True, False]
-
-
 def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
     one = Fit(blend(), Settings(), device, np.float32, pad=1)
     one.views = [replace(view, sqrt_weights=0.5 * view.sqrt_weights) for view in one.views]
@@ -110,26 +98,6 @@ def test_no_frequency_of_an_exposure_is_beyond_the_models_pixels():
         nu_y, nu_x, d = BandLimitedTransfer(matrix, sharp, sharp).at((11, 13), 4.0)
         assert 0.4 < nu_y.max() <= 0.5 and 0.4 < np.abs(nu_x).max() <= 0.5
         assert d.shape == (len(nu_y), 1, len(nu_x))
-
-
-def test_a_ridge_is_added_to_the_diagonal():
-    """Of what is seen a little; of what is not, so that it can be divided by."""
-    matrix, scale, seen = unit_diagonal(np.diag([4.0, 0.0]))
-    assert seen.tolist() == [True, False] and scale.tolist() == [2, 1]
-    np.testing.assert_allclose(np.diag(matrix), [1 + RIDGE, 1 + RIDGE], rtol=1e-15)
-    assert matrix[0, 1] == 0
-
-
-@pytest.mark.parametrize("refused", [1, 3])
-def test_trials_of_a_direction_are_counted_one_by_one(refused):
-    """A direction that leads nowhere is given up after the same number of trials as before."""
-    progress = LbfgsControl(1, 0.01, [100])
-    progress.loss[:], progress._fresh[:] = 10.0, False
-    for i in range(1, refused + 1):
-        accepted, _ = progress.accept_trials(np.array([11.0]), np.array([-1.0]))
-        assert not accepted[0]
-        progress.next_actions(accepted)
-        assert progress._trials[0] == i
 
 
 def test_an_exposure_shows_what_the_operator_renders(device):

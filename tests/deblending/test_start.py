@@ -1,4 +1,4 @@
-"""Where a fit starts: slopes as finite differences, spectra as scipy's, shapes and places found."""
+"""Starts of fits: slopes by finite differences, spectra by scipy, shapes and positions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Rules of a fit's start, each alone: boxes, thresholds, pairs of windows, light and darkness."""
+"""Rules of a fit's start, in tables: boxes, thresholds, pairs of windows, light and darkness."""
 
 from types import SimpleNamespace
 
@@ -7,8 +7,6 @@ import pytest
 from helpers.scenes import MODEL_PSF, frame
 
 from clresample.deblending.profiles import (
-    COMPONENT_SPREAD,
-    ELLIPTICITY_SCATTER,
     FixedProfile,
     GalaxyProfile,
     StarProfile,
@@ -22,7 +20,6 @@ from clresample.deblending.start.component_batch import (
     BOX_SIDES,
     ComponentBatch,
     StartComponent,
-    _box_about,
     boxes_of,
     cumulative_offsets,
     peaks_of,
@@ -35,7 +32,21 @@ from clresample.deblending.start.slot_observation import _listed, _pairs
 from clresample.paper.solver.scene import UNSEEN
 from clresample.sky.sources import ExtendedSource, PointSource
 
-BIG = (1000, 900)
+HOME, BIG = frame(), (1000, 900)
+GALAXY, STAR = GalaxyProfile(HOME), StarProfile(HOME, free=True)
+IMAGE = np.zeros((20, 30))
+IMAGE[[5, 5, 11, 0], [6, 9, 8, 0]] = 8.0, -2.0, 1.5, 0.5
+GIVEN = FixedProfile(IMAGE)
+
+
+def component(shape, scene=0, index=0, frame=BIG):
+    return StartComponent(scene, index, index, shape, np.array([14.3, 17.6]), frame)
+
+
+def box_about(middle, half, frame):
+    """Box of a component whose light reaches `half` to both sides of `middle` [px]."""
+    reaching = SimpleNamespace(bounding_box=lambda *_: (middle, half))
+    return boxes_of([component(reaching, frame=frame)], [None], [None])[0]
 
 
 def test_boxes_reach_to_a_hundredth_of_the_noise():
@@ -49,27 +60,28 @@ def test_boxes_reach_to_a_hundredth_of_the_noise():
     [(0, 24), (11.5, 24), (11.6, 40), (63.5, 128), (63.6, 256), (127.5, 256), (127.6, 512)],
 )
 def test_boxes_have_few_sizes(half, side):
-    """The least side that holds what reaches `half` to both sides of a pixel."""
     assert BOX_SIDES == (24, 40, 64, 96, 128)
-    for along in ((half, 0), (0, half)):
-        low, size = _box_about((500.0, 450.0), np.array(along), BIG)
-        assert size == [side, side] and low == [500 - side // 2, 450 - side // 2]
+    wanted = [500 - side // 2, 450 - side // 2], [side, side]
+    assert box_about((500.0, 450.0), (half, 0), BIG) == wanted
+    assert box_about((500.0, 450.0), (0, half), BIG) == wanted
 
 
 @pytest.mark.parametrize(
-    "middle, low", [((2, 97), (0, 76)), ((50.4, 60.5), (38, 49)), ((12, 88), (0, 76))]
+    "middle, half, shape, low, size",
+    [
+        ((2, 97), (5, 5), (100, 100), [0, 76], [24, 24]),
+        ((50.4, 60.5), (5, 5), (100, 100), [38, 49], [24, 24]),
+        ((12, 88), (5, 5), (100, 100), [0, 76], [24, 24]),
+        ((5, 50), (300, 10), (20, 90), [0, 0], [20, 90]),
+        ((5, 50), (300, 10), (20, 300), [0, 0], [20, 300]),
+        ((5, 150), (9, 9), (20, 300), [0, 138], [20, 24]),
+    ],
 )
-def test_boxes_lie_inside_the_frame(middle, low):
-    assert _box_about(middle, np.array([5.0, 5.0]), (100, 100)) == (list(low), [24, 24])
+def test_boxes_lie_inside_the_frame(middle, half, shape, low, size):
+    assert box_about(middle, half, shape) == (low, size)
 
 
-def test_a_box_is_no_larger_than_the_frame():
-    assert _box_about((5, 50), np.array([300.0, 10.0]), (20, 90)) == ([0, 0], [20, 90])
-    assert _box_about((5, 50), np.array([300.0, 10.0]), (20, 300)) == ([0, 0], [20, 300])
-    assert _box_about((5, 150), np.array([9.0, 9.0]), (20, 300)) == ([0, 138], [20, 24])
-
-
-def test_where_arrays_begin_that_follow_each_other():
+def test_first_elements_of_arrays_one_after_another():
     begin, n = cumulative_offsets(np.array([3, 4, 5]))
     assert begin.tolist() == [0, 3, 7] and n == 12
     assert cumulative_offsets(np.zeros(0, int))[1] == 0
@@ -78,82 +90,92 @@ def test_where_arrays_begin_that_follow_each_other():
         cumulative_offsets(np.array([2**30, 2**30]))
 
 
-def components(*shapes, scenes=None):
-    home = frame()
-    return [
-        StartComponent(0 if scenes is None else scenes[i], i, i, shape, np.array([14.3, 17.6]), BIG)
-        for i, shape in enumerate(shapes)
-    ], home
+THETA = np.array([0.7, 0.3, -0.2, 1.5])
 
 
-def test_peaks_are_those_of_what_is_drawn():
-    home = frame()
-    theta = np.array([0.7, 0.3, -0.2, 1.5])
-    stars = [
-        StarProfile(home, free=True),
-        GalaxyProfile(home),
-        FixedProfile(np.array([[1.0, 3.0], [4.0, 2.0]])),
-    ]
-    chosen, _ = components(*stars)
-    found = peaks_of(chosen, [np.zeros(2), theta, np.zeros(0)])
-    drawn = stars[1].draw(theta, (20, 20), (41, 41))[0]
-    np.testing.assert_allclose(found, [MODEL_PSF.images.max(), drawn[20, 20], 0.4])
+@pytest.mark.parametrize(
+    "shape, theta, peak",
+    [
+        (STAR, np.zeros(2), MODEL_PSF.images.max()),
+        (GALAXY, THETA, GALAXY.draw(THETA, (20, 20), (41, 41))[0][20, 20]),
+        (FixedProfile(np.array([[1.0, 3.0], [4.0, 2.0]])), np.zeros(0), 0.4),
+    ],
+)
+def test_peaks_are_those_of_drawn_profiles(shape, theta, peak):
+    beside = [component(GIVEN), component(shape), component(GALAXY)]
+    found = peaks_of(beside, [np.zeros(0), theta, GALAXY.mean])
+    assert found[1] == pytest.approx(peak) and found[0] == 1
 
 
 def test_galaxies_reach_as_far_as_they_are_above_the_threshold():
     """Along both axes, of a turned ellipse with wings."""
-    home = frame()
     theta, part = np.array([0.9, 0.3, -0.4, 1.2]), 0.01
-    image = GalaxyProfile(home).draw(theta, (100, 100), (201, 201))[0]
-    lit = image > part * image.max()
+    image = GALAXY.draw(theta, (100, 100), (201, 201))[0]
     half = galaxy_reach(theta[None], psf_second_moment(MODEL_PSF)[None], np.array([part]))[0]
     for axis in (0, 1):
-        along = np.flatnonzero(lit.any(axis=1 - axis))
+        along = np.flatnonzero((image > part * image.max()).any(axis=1 - axis))
         assert along[-1] - 100 <= half[axis] < along[-1] - 98
-    middle, own = GalaxyProfile(home).bounding_box(theta, (3.0, 4.0), part)
-    np.testing.assert_allclose([*middle, *own], [3, 4, *half])
-    box = boxes_of(components(GalaxyProfile(home))[0], [theta], np.array([part]))[0]
-    assert box == _box_about((14.3, 17.6), half, BIG)
+    np.testing.assert_allclose(GALAXY.bounding_box(theta, (3.0, 4.0), part), [(3, 4), half])
+    box = boxes_of([component(GALAXY)], [theta], np.array([part]))[0]
+    assert box == box_about((14.3, 17.6), half, BIG)
 
 
-def test_a_star_reaches_to_the_end_of_its_image_or_of_its_rings():
-    """0.002 px over the threshold, in parts of the peak, and a pixel."""
-    star = StarProfile(frame(), free=True)
-    n = max(MODEL_PSF.images.shape[1:])
-    for part, half in ((0.01, n / 2 + 1), (2e-5, 101.0)):
-        place, found = star.bounding_box(np.array([0.5, -0.25]), np.array([3.0, 4.0]), part)
-        np.testing.assert_allclose([*place, *found], [3.5, 3.75, half, half])
-    fixed = StarProfile(frame(), free=False)
-    assert fixed.center(np.zeros(0), (3.0, 4.0)) == (3.0, 4.0) and len(fixed.scatter) == 0
-    assert star.scatter.tolist() == [0.5, 0.5] and star.mean.tolist() == [0, 0]
+HALF = max(MODEL_PSF.images.shape[1:]) / 2 + 1
+PATCH = np.arange(12.0).reshape(3, 4)
 
 
-def test_a_given_profile_reaches_to_its_faintest_pixel_above_the_threshold():
-    image = np.zeros((20, 30))
-    image[5, 6], image[5, 9], image[11, 8], image[0, 0] = 8.0, -2.0, 1.5, 0.5
-    middle, half = FixedProfile(image).bounding_box(np.zeros(0), (0, 0), 1 / 16)
-    np.testing.assert_array_equal([*middle, *half], [8, 7.5, 4, 2.5])
-    assert FixedProfile(image).draw(None, None).sum() == 1 and FixedProfile(image).peak == 1
+@pytest.mark.parametrize(
+    "shape, theta, threshold, middle, half",
+    [
+        # a star: its image, or 0.002 px over the threshold of its rings, and a pixel
+        (STAR, [0.5, -0.25], 0.01, (3.5, 3.75), (HALF, HALF)),
+        (STAR, [0.5, -0.25], 2e-5, (3.5, 3.75), (101, 101)),
+        (GIVEN, [], 1 / 16, (8, 7.5), (4, 2.5)),  # to the faintest pixel above the threshold
+        (_ImageProfile(PATCH, (5, 7), (160, 160)), [], None, (79.5, 79.5), (160, 160)),
+        (_ImageProfile(PATCH, (5, 7), (161, 160)), [], None, (6, 8.5), (1.5, 2)),
+    ],
+)
+def test_reach_of_other_profiles(shape, theta, threshold, middle, half):
+    found = shape.bounding_box(np.array(theta), np.array([3.0, 4.0]), threshold)
+    np.testing.assert_allclose(found, [middle, half])
 
 
-def test_what_is_expected_of_galaxies():
-    """0.25" on pixels of 0.1", components of a source a factor e apart, round, wings of 6.5."""
-    one = GalaxyProfile(frame())
-    np.testing.assert_allclose(one.mean, [np.log(2.5), 0, 0, np.log(6.5)])
-    assert ELLIPTICITY_SCATTER == 0.17 and COMPONENT_SPREAD == 1
-    np.testing.assert_allclose(one.scatter, [0.4, 0.17, 0.17, 0.7])
-    free = StarProfile(frame(), free=True)  # half a pixel about its place
-    assert free.mean.tolist() == [0, 0] and free.scatter.tolist() == [0.5, 0.5]
-    wide = GalaxyProfile(frame(), 1, 2, widened=6.0)
-    assert wide.mean[0] == pytest.approx(np.log(2.5 * 6) + 0.5)
-    kinds = [
-        (PointSource(position_px=(1, 1)), [StarProfile]),
-        (ExtendedSource(position_px=(1, 1)), [GalaxyProfile]),
-        (ExtendedSource(position_px=(1, 1), n_components=2), [GalaxyProfile, GalaxyProfile]),
-        (ExtendedSource(position_px=(1, 1), profile=np.ones(frame().shape)), [FixedProfile]),
-    ]
-    for source, wanted in kinds:
-        assert [type(shape) for shape in components_of(source, frame())] == wanted
+def test_images_are_cut_to_boxes():
+    one, low, size = _ImageProfile(PATCH, (5, 7), (40, 40)), np.array([4, 8]), np.array([3, 2])
+    assert one.draw_box(None, None, low, size).tolist() == [[[0, 0], [1, 2], [5, 6]]]
+    assert GIVEN.draw(None, None).sum() == 1 and GIVEN.peak == 1
+
+
+WIDE = GalaxyProfile(HOME, 1, 2, widened=6.0)  # of two components, a factor e apart
+
+
+@pytest.mark.parametrize(
+    "shape, mean, scatter",
+    [  # 0.25" on pixels of 0.1", round, wings of 6.5; a star half a pixel about its position
+        (GALAXY, [np.log(2.5), 0, 0, np.log(6.5)], [0.4, 0.17, 0.17, 0.7]),
+        (WIDE, [np.log(15) + 0.5, 0, 0, np.log(6.5)], [0.4, 0.17, 0.17, 0.7]),
+        (STAR, [0, 0], [0.5, 0.5]),
+        (StarProfile(HOME, free=False), [], []),
+    ],
+)
+def test_expected_parameters_of_profiles(shape, mean, scatter):
+    np.testing.assert_allclose(shape.mean, mean)
+    np.testing.assert_allclose(shape.scatter, scatter)
+    assert mean or shape.center(np.zeros(0), (3.0, 4.0)) == (3.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    "kind, given, shapes",
+    [
+        (PointSource, {}, [StarProfile]),
+        (ExtendedSource, {}, [GalaxyProfile]),
+        (ExtendedSource, {"n_components": 2}, [GalaxyProfile, GalaxyProfile]),
+        (ExtendedSource, {"profile": np.ones(HOME.shape)}, [FixedProfile]),
+    ],
+)
+def test_profiles_of_sources(kind, given, shapes):
+    found = components_of(kind(position_px=(1, 1), **given), HOME)
+    assert [type(shape) for shape in found] == shapes
 
 
 def test_a_psf_is_drawn_without_its_neighbours_in_the_fft():
@@ -163,33 +185,24 @@ def test_a_psf_is_drawn_without_its_neighbours_in_the_fft():
     assert np.abs(image[12:]).max() < 1e-6 and np.abs(image[:, 12:]).max() < 1e-6
     whole = draw_psf(MODEL_PSF, (20.25, 22.5), (41, 45))
     assert whole[0].sum() == pytest.approx(1, abs=1e-3) and len(whole) == 3
-    y, x = np.indices(whole[0].shape)
-    middle = [(v * whole[0]).sum() for v in (y, x)]
+    middle = [(v * whole[0]).sum() for v in np.indices(whole[0].shape)]
     np.testing.assert_allclose(middle, [20.25, 22.5], atol=0.03)
 
 
 def test_slots_of_equal_boxes_follow_each_other():
-    """By size, then how many images, then scene; runs end where any of these changes."""
-    home = frame()
-    shapes = [
-        GalaxyProfile(home),
-        StarProfile(home, free=False),
-        GalaxyProfile(home),
-        GalaxyProfile(home),
-        GalaxyProfile(home),
-    ]
-    chosen, _ = components(*shapes, scenes=[1, 0, 0, 1, 0])
+    """By size, then number of images, then scene; runs end where any of these changes."""
+    shapes = [GALAXY, StarProfile(HOME, free=False), GALAXY, GALAXY, GALAXY]
+    chosen = [component(*one) for one in zip(shapes, [1, 0, 0, 1, 0], range(5), strict=True)]
     thetas = [np.zeros(len(shape.mean)) for shape in shapes]
     boxes = [((0, 0), (n, m)) for n, m in ((24, 24), (24, 24), (40, 24), (24, 24), (24, 40))]
     slots = ComponentBatch(chosen, thetas, boxes, slopes=True)
-    assert slots.order.tolist() == [1, 0, 3, 2, 4] or slots.order.tolist() == [1, 0, 3, 4, 2]
+    assert slots.order.tolist() in ([1, 0, 3, 2, 4], [1, 0, 3, 4, 2])
     assert slots.n_images.tolist() == [1, 5, 5, 5, 5]
     sizes = slots.n_images * slots.size.prod(axis=1)
     assert slots.begin.tolist() == [0, *np.cumsum(sizes)[:-1]] and slots.n_elements == sizes.sum()
     assert slots.runs(np.zeros(5)) == [(0, 1), (1, 3), (3, 4), (4, 5)]
     assert slots.runs(np.array([0, 7, 8, 0, 0])) == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
-    bare = ComponentBatch(chosen, thetas, boxes, slopes=False)
-    assert bare.n_images.tolist() == [1] * 5
+    assert ComponentBatch(chosen, thetas, boxes, slopes=False).n_images.tolist() == [1] * 5
 
 
 def test_slots_are_listed_by_scene():
@@ -200,76 +213,63 @@ def test_slots_are_listed_by_scene():
     assert _listed(slots, [3])[2].tolist() == [0]
 
 
-def test_pairs_are_windows_of_one_scene_that_meet_on_the_pixels():
-    #          scene low     size
-    place = [
-        (0, -2, 0, 6, 5),
-        (0, 3, 4, 4, 4),
-        (0, 4, 0, 3, 4),
-        (1, 3, 4, 4, 4),
-        (0, 9, 9, 5, 5),
-        (0, 2, 2, 0, 3),
-    ]
-    found = _pairs(np.array(place)[:, 0], np.array(place)[:, 1:], (10, 11))
+def test_pairs_are_windows_of_one_scene_that_overlap_on_the_pixels():
+    windows = [(0, -2, 0, 6, 5), (0, 3, 4, 4, 4), (0, 4, 0, 3, 4)]  # scene, low, size
+    windows = np.array([*windows, (1, 3, 4, 4, 4), (0, 9, 9, 5, 5), (0, 2, 2, 0, 3)])
     wanted = [
         (0, 0, 0, 0, 4, 5),  # cut at row 0
         (0, 1, 3, 4, 1, 1),
         (1, 1, 3, 4, 4, 4),
-        (2, 2, 4, 0, 3, 4),  # beside both others, and meets none
+        (2, 2, 4, 0, 3, 4),  # beside both others, without overlap
         (4, 4, 9, 9, 1, 2),  # cut at the last pixels
         (3, 3, 3, 4, 4, 4),
     ]
+    found = _pairs(windows[:, 0], windows[:, 1:], (10, 11))
     assert sorted(map(tuple, found.tolist())) == sorted(wanted)
 
 
-def test_darkness_is_under_three_sigma_in_any_channel_and_in_all_together():
+def test_dark_positions_have_under_3_sigma_in_every_channel_and_in_all():
     assert LIGHT_SIGMAS == 3
     snr = [(2.9, 0, 0), (3.1, 0, 0), (2.0, 2.0, 0), (2.2, 2.2, 0), (2.0, 2.0, 1.1), (-9, 3.1, 0)]
-    assert _is_dark(np.array(snr)).tolist() == [True, False, True, False, True, False]
-    assert _is_dark(np.zeros((1, 3))).tolist() == [True]
-    assert _is_dark(np.full((1, 100), 0.31)).tolist() == [False]  # faint in each of many
-    assert _is_dark(np.full((1, 100), 0.29)).tolist() == [True]
+    assert _is_dark(np.array([*snr, (0, 0, 0)])).tolist() == [True, False] * 3 + [True]
+    faint_in_many = np.array([np.full(100, 0.31), np.full(100, 0.29)])
+    assert _is_dark(faint_in_many).tolist() == [False, True]
 
 
 @pytest.mark.parametrize("centre", [(14.3, 17.6), (-0.4, 35.4), (29.4, 0.0)])
-def test_the_peak_of_a_profile_is_its_largest_pixel_on_the_frame(centre):
-    home = frame()
-    for shape, theta in (
-        (StarProfile(home, free=True), np.zeros(2)),
-        (GalaxyProfile(home), GalaxyProfile(home).mean),
-    ):
-        place = np.array(centre)
-        wanted = shape.draw(theta, place)[0].max()
-        found = profile_peak(shape, theta, place, place, home.shape)
-        assert found == pytest.approx(wanted, rel=1e-4)
+@pytest.mark.parametrize("shape", [STAR, GALAXY])
+def test_the_peak_of_a_profile_is_its_largest_pixel_on_the_frame(shape, centre):
+    place = np.array(centre)
+    wanted = shape.draw(shape.mean, place)[0].max()
+    found = profile_peak(shape, shape.mean, place, place, HOME.shape)
+    assert found == pytest.approx(wanted, rel=1e-4)
 
 
 def test_parameters_without_the_spectra_are_a_schur_complement():
-    """Of those that are free alone, with the ridge on the others' own diagonal."""
+    """Of free spectra alone, with the ridge on the others' own diagonal."""
     rng = np.random.default_rng(1)
     k, n_channels, n, p = 2, 3, 2, 4
     size, m = n * p, n + 1
-    normal, right = np.zeros((k, n, p, n, p)), rng.normal(size=(k, n, p))
-    inner, cross = np.zeros((k, n_channels, m, m)), rng.normal(size=(k, n_channels, m, n, p))
-    for b in range(k):
-        a = rng.normal(size=(size, size))
-        normal[b] = (a @ a.T + 50 * np.eye(size)).reshape(n, p, n, p)
-        for c in range(n_channels):
-            a = rng.normal(size=(m, m))
-            inner[b, c] = a @ a.T + np.eye(m)
+
+    def positive(shape, n, level):
+        a = rng.normal(size=(*shape, n, n))
+        return a @ np.swapaxes(a, -1, -2) + level * np.eye(n)
+
+    normal, inner = positive((k,), size, 50.0), positive((k, n_channels), m, 1.0)
+    right, cross = rng.normal(size=(k, size)), rng.normal(size=(k, n_channels, m, size))
     rest, lit = rng.normal(size=(k, n_channels, m)), rng.random((k, n_channels, m)) > 0.3
     assert not lit.all()
-    found = _eliminated(normal.copy(), right.copy(), inner.copy(), cross.copy(), rest, lit)
+    given = normal.reshape(k, n, p, n, p).copy(), right.reshape(k, n, p).copy(), inner.copy()
+    found = _eliminated(*given, cross.reshape(k, n_channels, m, n, p).copy(), rest, lit)
     for b in range(k):
-        wanted, pull = normal[b].reshape(size, size).copy(), right[b].ravel().copy()
         for c in range(n_channels):
             on = np.flatnonzero(lit[b, c])
-            x = cross[b, c].reshape(m, size)[on]
+            x = cross[b, c, on]
             solved = np.linalg.solve(inner[b, c][np.ix_(on, on)], np.c_[x, rest[b, c, on]])
-            wanted -= x.T @ solved[:, :-1]
-            pull -= x.T @ solved[:, -1]
-        np.testing.assert_allclose(found[0][b], wanted, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(found[1][b], pull, rtol=1e-5, atol=1e-5)
+            normal[b] -= x.T @ solved[:, :-1]
+            right[b] -= x.T @ solved[:, -1]
+    for part, wanted in zip(found, (normal, right), strict=True):
+        np.testing.assert_allclose(part, wanted, rtol=1e-5, atol=1e-5)
 
 
 def test_spectra_of_two_equal_profiles_can_be_eliminated():
@@ -277,32 +277,27 @@ def test_spectra_of_two_equal_profiles_can_be_eliminated():
     cross, rest = np.ones((1, 1, 3, 2, 4)), np.ones((1, 1, 3))
     cross[:, :, 2], rest[..., 2] = 0, 0
     lit = np.array([[[True, True, False]]])
-    normal, right = _eliminated(
-        np.zeros((1, 2, 4, 2, 4)), np.zeros((1, 2, 4)), inner, cross, rest, lit
-    )
-    np.testing.assert_allclose(normal, -0.5, rtol=1e-6)
-    np.testing.assert_allclose(right, -0.5, rtol=1e-6)
+    given = np.zeros((1, 2, 4, 2, 4)), np.zeros((1, 2, 4)), inner, cross, rest, lit
+    for part in _eliminated(*given):
+        np.testing.assert_allclose(part, -0.5, rtol=1e-6)
 
 
-def test_small_frames_are_seen_whole_and_large_ones_in_boxes():
-    """160 pixels a side are small."""
-    image = np.arange(12.0).reshape(3, 4)
-    middle, half = _ImageProfile(image, (5, 7), (160, 160)).bounding_box(None, None, None)
-    assert middle.tolist() == [79.5, 79.5] and half.tolist() == [160, 160]
-    middle, half = _ImageProfile(image, (5, 7), (161, 160)).bounding_box(None, None, None)
-    assert middle.tolist() == [6, 8.5] and half.tolist() == [1.5, 2]
-    cut = _ImageProfile(image, (5, 7), (40, 40)).draw_box(
-        None, None, np.array([4, 8]), np.array([3, 2])
-    )
-    np.testing.assert_array_equal(cut, [[[0, 0], [1, 2], [5, 6]]])
-
-
-def test_what_is_hardly_seen_is_not_seen():
-    """Diagonals under 1e-12 of the largest root; each has its own ridge."""
-    matrix, scale, seen = unit_diagonal(np.diag([1.0, 1.1e-24, 0.9e-24]))
-    assert seen.tolist() == [True, True, False]
-    np.testing.assert_allclose(scale, [1, np.sqrt(1.1e-24), 1])
-    np.testing.assert_allclose(np.diag(matrix), 1 + RIDGE, rtol=1e-15)
-    both = unit_diagonal(np.array([[[4.0, 3.0], [3.0, 9.0]], [[0.0, 0.0], [0.0, 0.0]]]))
-    np.testing.assert_allclose(both[0][0], [[1 + RIDGE, 0.5], [0.5, 1 + RIDGE]], rtol=1e-15)
-    assert not both[2][1].any() and UNSEEN == 1e14
+@pytest.mark.parametrize(
+    "given, scale, seen, beside",
+    [
+        ([[1.0, 0, 0], [0, 1.1e-24, 0], [0, 0, 0.9e-24]], [1, np.sqrt(1.1e-24), 1], [1, 1, 0], 0),
+        ([[4.0, 0.0], [0.0, 0.0]], [2, 1], [1, 0], 0),
+        ([[4.0, 3.0], [3.0, 9.0]], [2, 3], [1, 1], 0.5),
+        ([[0.0, 0.0], [0.0, 0.0]], [1, 1], [0, 0], 0),
+    ],
+)
+def test_normal_matrices_have_a_unit_diagonal_with_a_ridge(given, scale, seen, beside):
+    """Diagonals under 1e-12 of the largest root do not count, but can be divided by."""
+    found = unit_diagonal(np.array([given, given]))
+    n = len(scale)
+    wanted = np.full((n, n), beside) + (1 + RIDGE - beside) * np.eye(n)
+    for matrix, sizes, known in zip(*found, strict=True):
+        np.testing.assert_allclose(matrix, wanted, rtol=1e-15)
+        np.testing.assert_allclose(sizes, scale)
+        assert known.tolist() == list(map(bool, seen))
+    assert UNSEEN == 1e14

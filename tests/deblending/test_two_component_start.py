@@ -1,4 +1,4 @@
-"""Where a second fit begins, on fits made by hand."""
+"""Starts of second fits, on fits made by hand."""
 
 from types import SimpleNamespace
 

@@ -151,7 +151,7 @@ def test_windows_are_cut_to_the_observation(low):
 
 
 def test_a_profile_read_off_images_is_symmetric_and_above_the_noise():
-    """What one side alone shows is not in it; light under one sigma is none."""
+    """Light on one side alone is omitted; light under one sigma is 0."""
     image = np.arange(30.0).reshape(5, 6)
     mirrored = image_profiles._mirror(image, (1, 2))
     assert mirrored[0, 0] == image[2, 4] and mirrored[2, 4] == image[0, 0]
@@ -232,7 +232,7 @@ def test_extended_sources_of_one_component_get_profiles(monkeypatch):
 
 
 def test_sources_outside_an_observation_have_its_psf_at_the_nearest_pixel():
-    """Where the observation's projection holds none of them, that at its middle."""
+    """If the observation's projection contains none of them, that at its middle."""
     at = np.array([[3.0, 4.0], [-2.0, 50.0], [np.nan, np.nan], [10.0, 40.0]])
     grid = SimpleNamespace(positions_in=lambda grid, y, x: at)
     home = view_module.SceneGeometry(SimpleNamespace(grid=grid), None, np.zeros((4, 2)), 0.0)

@@ -65,7 +65,7 @@ def moved(weight, sky=0.0, mask=False):
 
 
 def test_the_sky_and_masks_move_nothing():
-    """What the model and the sky explain is taken off before the slopes are asked."""
+    """Light that the model and the sky explain is subtracted before the slopes are fitted."""
     steps, _ = shift_steps(*moved(1e4, sky=3.0, mask=True))
     assert steps[0].tolist() == [0, 0]
     np.testing.assert_allclose(steps[1], SHIFT, rtol=0.05)
@@ -181,7 +181,7 @@ def test_signal_to_noise_is_zero_where_nothing_was_seen(device):
 
 
 def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(device):
-    """Which is made already, whatever the frame's sides are."""
+    """That operator exists already, whatever the frame's sides are."""
     star, _, views = a_star(device, (20, 23))
     looking = linearise([views], [star], PRECISION, 0.0, fit_sky=False)
     looking.render([0], [np.zeros(2)], np.ones(1), slopes=True)
@@ -247,7 +247,7 @@ def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
 
 
 def test_light_lies_in_the_middle_of_its_window():
-    """Where that is larger than one scene's light needs; mappings begin where the light does."""
+    """If that is larger than one scene's light needs; mappings begin at the first light."""
     rng = np.random.default_rng(0)
     maps = [
         SimpleNamespace(offset=rng.normal(size=2), matrix=rng.normal(size=(2, 2))) for _ in "ab"

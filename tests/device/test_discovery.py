@@ -35,7 +35,7 @@ def test_every_form_of_choice(monkeypatch):
 
 
 class Fake:
-    """What discovery reads of a pyopencl device or platform."""
+    """The attributes of a pyopencl device or platform that discovery reads."""
 
     def __init__(self, name, platform=None, kind="CPU", available=True):
         self.name, self.platform, self.available = name, platform, available

@@ -28,7 +28,7 @@ def machine(tmp_path, monkeypatch):
 
 
 class Gpu:
-    """What is read of a pyopencl device that a real GPU's driver brings."""
+    """The attributes of a pyopencl device of a real GPU's driver that are read."""
 
     type = cl.device_type.GPU
     name = "H100"

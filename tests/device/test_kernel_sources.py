@@ -1,4 +1,4 @@
-"""What every kernel source keeps to, so that it builds anywhere and can be read alone."""
+"""Rules of all kernel sources: each builds on any device and can be read alone."""
 
 import re
 
@@ -100,11 +100,11 @@ def test_sizes_are_macros_that_kernels_take(device, monkeypatch, kind, dtype):
 
 
 @pytest.mark.parametrize("words", [r"set_args?\(", "set_scalar_arg_dtypes", r"device\.kind\b"])
-def test_one_room_sets_arguments_and_asks_for_the_kind_of_device(words):
+def test_one_package_sets_arguments_and_reads_the_kind_of_device(words):
     """Arguments go by name, and what depends on the device is in Tuning."""
     files = (ROOT / "clresample").rglob("*.py")
-    rooms = {path.parent.name for path in files if re.search(words, path.read_text())}
-    assert rooms - {"device_tools"} == {"device"}  # `clresample tune` keeps its finds by kind
+    packages = {path.parent.name for path in files if re.search(words, path.read_text())}
+    assert packages - {"device_tools"} == {"device"}  # `clresample tune` keeps its finds by kind
 
 
 def test_faults_are_seen():

@@ -23,7 +23,7 @@ def fresh(device):
 
 @pytest.fixture
 def built(monkeypatch):
-    """How often each program was built, by (file, dtype, macros)."""
+    """Number of builds of each program, by (file, dtype, macros)."""
     counts, build = Counter(), Programs._built
 
     def counted(self, file, dtype, defines):

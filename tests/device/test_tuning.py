@@ -237,7 +237,7 @@ def test_as_many_are_fitted_as_the_time_allows(first, fixed, each, n_most, tried
 
 
 class Gpu:
-    """What `peak_flops` reads of an H100."""
+    """The attributes of an H100 that `peak_flops` reads."""
 
     kind, simulated, compute_units = "GPU", False, 132
 

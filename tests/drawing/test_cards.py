@@ -1,4 +1,4 @@
-"""What notebooks show: one line, a card, a figure; none of them holds a dump of arrays."""
+"""Displays of objects in notebooks: one line, a card, a figure; none dumps arrays."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What the files of a run say of themselves: units, descriptions, provenance."""
+"""Descriptions in the files of a run: units, meanings, provenance."""
 
 import hashlib
 import json

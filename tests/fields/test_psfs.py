@@ -155,7 +155,7 @@ def test_piff_is_drawn_at_pixels_that_count_from_one(tmp_path, grid):
 
 
 class Gridded:
-    """What of photutils' GriddedPSFModel is read: PSFs on two rows and three columns."""
+    """The attributes of photutils' GriddedPSFModel that are read, of PSFs on a 2 x 3 grid."""
 
     oversampling = np.array([2, 2])
     grid_xypos = [(x, y) for x in (10.0, 50.0, 90.0) for y in (20.0, 80.0)]

@@ -17,7 +17,7 @@ VALUES += [[v] for v in ("a", 0, 1.5, -2, True, [])] + [[1, 2], [0.5, "b"], [1, 
 
 
 def fits(schema, value):
-    """Whether a value fits a schema, of the words that ours have."""
+    """True if a value fits a schema, for the keywords that ours have."""
     if "anyOf" in schema:
         return any(fits(one, value) for one in schema["anyOf"])
     if "enum" in schema:

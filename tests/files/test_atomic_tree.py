@@ -12,7 +12,7 @@ from clresample.files.atomic import FileError, atomic_file, atomic_tree, check_f
 
 
 def listed(folder):
-    """What is in a folder {name: text}, apart from what is being written."""
+    """Content of a folder {name: text}, without unfinished files."""
     files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.is_file()}
     return {name: p.read_text() for name, p in files.items() if not name.startswith(".")}
 

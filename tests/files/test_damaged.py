@@ -140,7 +140,7 @@ def in_archive(raw):
 
 
 def test_a_number_that_stands_twice_is_refused(tmp_path):
-    """Which of the two astropy takes depends on where it asks."""
+    """Astropy would take one or the other, depending on the way it reads."""
     path = tmp_path / "p.fits"
     many(path)
     claim(path, "EXTEND", "T")

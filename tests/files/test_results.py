@@ -24,7 +24,7 @@ from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def same(one, other, where="result"):
-    """Assert that two values of any kind in a Result are equal, bit by bit."""
+    """Asserts that two values of any kind in a Result are equal, bit by bit."""
     assert type(one) is type(other), where
     if isinstance(one, np.ndarray):
         assert one.dtype == other.dtype, where

@@ -1,1 +1,1 @@
-"""What several tests share: scenes, blends, headers, geometries, the checkout."""
+"""Code that several tests share: scenes, blends, headers, geometries, the checkout."""

@@ -13,7 +13,7 @@ from helpers.checkout import ROOT
 
 
 def run_bench(module, *options):
-    """What `python -m bench.MODULE OPTIONS` prints; SystemExit where it ends so.
+    """Output of `python -m bench.MODULE OPTIONS`; raises SystemExit if it ends so.
 
     A process of its own would be started anew with one thread for each library.
     """
@@ -29,7 +29,7 @@ def run_bench(module, *options):
 
 
 def bench_json(folder, module, *options):
-    """What a benchmark writes into a file of the folder, which holds nothing else of it."""
+    """Content of the one file that a benchmark writes into the folder."""
     file = folder / f"{module}.json"
     run_bench(module, *options, "--json", file)
     return json.loads(file.read_text())

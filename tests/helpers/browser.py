@@ -143,7 +143,7 @@ class Browser:
         return self.chromium.ask(method, self.session, **parameters)
 
     def note(self, event):
-        """Keep what a page should never do."""
+        """Keeps what a page should never do."""
         given = event.get("params", {})
         match event.get("method"):
             case "Runtime.exceptionThrown":
@@ -158,24 +158,24 @@ class Browser:
                     self.messages.append(f"asks for {url}")
 
     def save_into(self, folder):
-        """Let the page save files there."""
+        """Lets the page save files there."""
         where = {"behavior": "allow", "downloadPath": str(folder)}
         self.ask("Browser.setDownloadBehavior", browserContextId=self.profile, **where)
 
     def open(self, path, anchor=""):
-        """Show a file, and wait until all of it is there."""
+        """Shows a file, and waits until all of it is there."""
         self.ask("Page.navigate", url=f"{path.absolute().as_uri()}{anchor}")
         self.until("document.readyState === 'complete' && location.protocol === 'file:'")
 
     def value(self, expression):
-        """What an expression is in the page, or what its promise gives."""
+        """Value of an expression in the page, or of its promise."""
         how = {"returnByValue": True, "awaitPromise": True}
         answer = self.ask("Runtime.evaluate", expression=expression, **how)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def until(self, expression):
-        """Wait until an expression is true in the page; its value."""
+        """Waits until an expression is true in the page; its value."""
         end = time.monotonic() + PATIENCE_S
         while not (found := self.value(expression)):
             assert time.monotonic() < end, f"{expression} stays {found!r}"

@@ -8,7 +8,7 @@ GUARD = np.full(1 << 14, 0xA5, np.uint8)  # 16 KiB: some rows of a small image
 
 
 def fill_with_nan(patch):
-    """Let every new buffer of every device hold NaN, or the largest number of its type."""
+    """Lets every new buffer of every device hold NaN, or the largest number of its type."""
     empty = Device.empty
 
     def filled(self, shape, dtype):

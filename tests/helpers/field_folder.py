@@ -18,7 +18,7 @@ INSTRUMENTS = {"Euclid": ("VIS",), "Rubin": ("g", "r", "i")}
 def write_folder(
     folder, *, n_sources=12, n_px=160, instruments=INSTRUMENTS, seed=3, part_from=0, status=None
 ):
-    """Write catalogue.fits, fit_table.ecsv, model and residual mosaics, provenance.json.
+    """Writes catalogue.fits, fit_table.ecsv, model and residual mosaics, provenance.json.
 
     n_px: of the first instrument a side; later ones have pixels twice as large, turned by 12 deg
     part_from: column of the field at which its images begin, as those of a part do

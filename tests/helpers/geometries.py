@@ -129,7 +129,7 @@ def operator(device, mapping, psf_in, psf_out, dtype=np.float32, **options):
 
 
 def expected(op, images, psf_in, psf_out):
-    """What the float64 oracle gives for an operator's mapping and padding."""
+    """Result of the float64 oracle for an operator's mapping and padding."""
     return reference.resample(images, op.mapping, psf_in, psf_out, op.certificate.n_fft)
 
 

@@ -13,7 +13,7 @@ def kernel(n_pixels, taps, step):
 
 
 def gauged(image, profile):
-    """What is left of an image without its part along the profile."""
+    """An image without its part along the profile."""
     return image - profile * (profile * image).sum() / (profile * profile).sum()
 
 

@@ -31,7 +31,7 @@ def morphologies(boxes, dtype, seed=5):
 
 
 def apply(device, prox, boxes, images, dtype=np.float32, **options):
-    """What the operator makes of images on the device."""
+    """Results of the operator for images on the device."""
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no double precision")
     flat = device.put(boxes.pack(images, dtype=dtype))

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def falls(progress, *drops):
-    """Let the loss of each scene have fallen by its drop in each of the last iterations."""
+    """Lets the loss of each scene have fallen by its drop in each of the last iterations."""
     count = np.arange(progress._losses.shape[1])
     progress._losses[:] = progress.loss[:, None] + np.array(drops)[:, None] * count
     progress._losses[:, 0] = progress.loss

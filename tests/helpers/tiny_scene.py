@@ -81,7 +81,7 @@ def deblend(folder, *more, output="out"):
 
 
 def change(folder, old, new):
-    """Put something else into the scene file."""
+    """Puts something else into the scene file."""
     text = (folder / "scene.toml").read_text()
     assert old in text
     (folder / "scene.toml").write_text(text.replace(old, new, 1))

@@ -6,6 +6,6 @@ from clresample.device.tuning import Tuning
 
 
 def tune(monkeypatch, **sizes):
-    """Let every Tuning have these sizes, whatever the device."""
+    """Lets every Tuning have these sizes, whatever the device."""
     of = Tuning.of
     monkeypatch.setattr(Tuning, "of", lambda *device: replace(of(*device), **sizes))

@@ -21,7 +21,7 @@ GRID = Grid.flat((60, 70), SCALE)
 
 
 def sums_of(image):
-    """What Errors.beyond holds of an image (ny, nx): its sum, and those of it times y, x, ..."""
+    """Errors.outside_box_moments of an image (ny, nx): sums of it, and of it times y, x, ..."""
     y, x = np.indices(image.shape)
     return np.array([(image * part).sum() for part in (1, y, x, y * y, y * x, x * x)])
 

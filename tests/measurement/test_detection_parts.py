@@ -80,7 +80,7 @@ def test_a_peak_of_all_images_within_the_wider_psf_is_the_same_source(monkeypatc
 
 
 def test_beyond_the_border_of_an_image_nothing_is_seen():
-    """Where less than a tenth of a PSF's light lies on pixels, a hot pixel near by is no source."""
+    """If less than a tenth of a PSF's light lies on pixels, a hot pixel near by is no source."""
     half = Grid.flat((60, 30), 0.1, center_arcsec=(0, -1.5))
     data = np.zeros(half.shape)
     data[30, 29] = 1e4

@@ -16,7 +16,7 @@ from clresample.measurement.late_sources import (
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit of a blend, here a word, returns."""
+    """Result of a fit of a blend, here a word."""
 
     blend: str
     by: str

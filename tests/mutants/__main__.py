@@ -1,13 +1,13 @@
-"""Do the tests notice slips in a module, or in a whole room? `make mutants MODULE=PATH`.
+"""Tries whether the tests notice slips in a module or a package: `make mutants MODULE=PATH`.
 
     python -m tests.mutants PATH [--n 20] [--seed 0] [--lines 10,12] [--tests FILE ...]
 
-PATH is a file or a folder of the package or of kernels/. Each mutation changes one token as a slip
-of the pen would: a sign, a comparison, a factor, a number, min for max. The tests that run the
-changed line (those of the module's room) are tried on a copy of the checkout, the quickest first,
-until one fails. What runs too long counts as killed; what no longer compiles is not counted.
-equivalent.toml lists mutations that change nothing that a test could see. The exit status says
-whether all others were killed.
+PATH is a file or a folder of the package or of kernels/. Each mutation changes one token as a
+typing error would: a sign, a comparison, a factor, a number, min for max. Tests of the module's
+package that run the changed line are tried on a copy of the checkout, the quickest first, until one
+fails. A mutation that runs too long counts as killed; one that does not compile is not counted.
+equivalent.toml lists mutations that no test can detect. The exit status is 0 if all others were
+killed.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def sample_of(options):
 
 
 def main():
-    """Run the sample; the exit status says whether all mutations were killed."""
+    """Runs the sample; the exit status says whether all mutations were killed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

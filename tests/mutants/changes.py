@@ -87,7 +87,7 @@ class Mutation:
 
     @property
     def change(self):
-        """What became of what."""
+        """Shown change, for example "< -> <="."""
         return f"{self.old} -> {self.new or 'nothing'}"
 
     def applied(self, text):

@@ -1,4 +1,4 @@
-"""Which tests may notice a mutation, the likeliest and quickest first.
+"""Selects tests that may notice a mutation, the likeliest and quickest first.
 
 What each test runs is recorded once (record.py) and kept in .mutants/ until the package, the tests'
 helpers or the test's own file change.
@@ -20,20 +20,20 @@ def test_files(path):
     """The test files, relative to the checkout, that may notice a change of a file or folder."""
     parts = path.relative_to(ROOT).parts
     if parts[0] == "kernels":
-        rooms = ["device", "resampling", "deblending", "paper", "measurement"]
+        packages = ["device", "resampling", "deblending", "paper", "measurement"]
     elif len(parts) > 2 or path.is_dir():
-        rooms = {"deblending": ["deblending", "measurement", "paper"]}.get(parts[1], [parts[1]])
+        packages = {"deblending": ["deblending", "measurement", "paper"]}.get(parts[1], [parts[1]])
     else:
-        rooms = ["resampling", "deblending"]
+        packages = ["resampling", "deblending"]
     return sorted(
         str(file.relative_to(ROOT))
-        for room in rooms
-        for file in (ROOT / "tests" / room).glob("test_*.py")
+        for package in packages
+        for file in (ROOT / "tests" / package).glob("test_*.py")
     )
 
 
 class Covering:
-    """What the tests of some files run.
+    """Lines of code that the tests of some files run.
 
     serve: a function that takes a request of serve.py and returns its answer
     folder: the copy of the checkout in which they ran

@@ -63,7 +63,7 @@ class Recorder:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef):
-        """What a session sets up once is none of the time of the test that is its first."""
+        """Fixtures of a session do not count in the time of the first test that uses them."""
         began = _seconds()
         value = yield
         if fixturedef.scope == "session":

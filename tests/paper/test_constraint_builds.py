@@ -27,7 +27,7 @@ SHAPE, CENTER = (17, 19), (6, 11)  # more pixels than four for each work-item of
 
 @pytest.fixture
 def in_groups(device, monkeypatch):
-    """Run a function with each number of work-items a source, watching all buffers."""
+    """Runs a function with each number of work-items a source, watching all buffers."""
 
     def run(check):
         for group in GROUPS:

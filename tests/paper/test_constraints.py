@@ -156,7 +156,7 @@ def test_parameters_per_source(device, boxes):
 
 
 def test_factors_keep_the_model(device, boxes):
-    """What was divided out is returned, over both launches of a chain of nine steps."""
+    """The divisor is returned, over both launches of a chain of nine steps."""
     images = [abs(image) + 0.1 for image in morphologies(boxes, np.float32)]
     images[3][:] = 0
     for prox in (

@@ -70,7 +70,7 @@ def galaxies(shape):
 
 
 def allowed(mapping, psf_in, psf_out, n_fft):
-    """What the cut of the sincs may do to white noise, and to galaxies.
+    """Limits on the effect of the sincs' truncation, for white noise and for galaxies.
 
     A sinc that ends at K/2 smooths the step e that |D| makes at its band's edge: by e/2 at most at
     the edge itself, by e / (2 pi K x) at a distance x (galaxies: 0.1); P2's sincs and the model's.

@@ -50,7 +50,7 @@ def toml(value):
 
 
 def one_line(error, *names):
-    """What a user reads of an error, on a terminal."""
+    """Text of an error on a terminal."""
     text = printable(" ".join(str(error).split()), 900)
     assert text.isprintable() and len(text) < 1000
     assert all(str(name) in text for name in names)

@@ -37,7 +37,7 @@ def browser(page):
 
 
 def seen(browser):
-    """What the field's canvas shows: (Ny, Nx, 3)."""
+    """Image in the field's canvas: (Ny, Nx, 3)."""
     image = pytest.importorskip("PIL.Image")
     box = browser.value("JSON.stringify(document.getElementById('sky').getBoundingClientRect())")
     x, y, width, height = (
@@ -48,7 +48,7 @@ def seen(browser):
 
 
 def place(browser, row):
-    """Where a source (counted from the brightest) is in the window."""
+    """Position of a source (counted from the brightest) in the window."""
     return browser.value(
         f"(() => {{ const box = document.getElementById('sky').getBoundingClientRect();"
         "const [ny, nx] = DATA.frame.shape;"

@@ -70,7 +70,7 @@ def browser(shared, page):
 
 
 def choose(browser, name, value):
-    """Choose in a list, or write into a field."""
+    """Chooses in a list, or writes into a field."""
     browser.value(
         f"(() => {{ const e = byId('{name}'); e.value = '{value}';"
         "for (const kind of ['input', 'change'])"
@@ -85,7 +85,7 @@ def text(browser, name):
 
 
 def saved(browser, button):
-    """What a button saves."""
+    """File that a button saves."""
     browser.value(f"delete {ROOT}.saved")
     browser.value(f"{button}.click()")
     path = browser.saved / browser.until(f"{ROOT}.saved")

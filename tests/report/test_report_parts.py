@@ -1,4 +1,4 @@
-"""What the report is made of: PNG, tiles, places of tiles, maps of chi2, matches, axes."""
+"""Parts of the report: PNG, tiles and their positions, maps of chi2, matches, axes."""
 
 import base64
 import io

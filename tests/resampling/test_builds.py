@@ -24,7 +24,7 @@ from clresample.testing import check_adjoint
 
 @pytest.fixture
 def builds(device, monkeypatch):
-    """Run a function of the device with each build that it takes, watching all buffers."""
+    """Runs a function of the device with each build that it takes, watching all buffers."""
     kinds = ("CPU", "GPU") if device.kind == "CPU" else (device.kind,)
 
     def run(check):
@@ -142,7 +142,7 @@ def test_the_papers_scheme(builds, name):
 
 
 def test_a_buffer_left_unwritten_and_an_overrun_are_seen(builds, device):
-    """What the fixture is for."""
+    """The fixture detects both."""
 
     def unwritten(device):
         assert np.isfinite(device.get(device.empty(7, np.float32))).all()

@@ -1,4 +1,4 @@
-"""What operators and tiles are said to take, against what they take; sizes, groups, warnings."""
+"""Predicted memory of operators and tiles against the measured; sizes, groups, warnings."""
 
 import gc
 from dataclasses import replace

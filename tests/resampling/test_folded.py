@@ -62,7 +62,7 @@ def test_images_are_rounded_in_and_out_and_nowhere_else(device, geometry):
 
 
 def test_float32_all_the_way_rounds_more(device):
-    """What the above would say of the sums in float32."""
+    """Sums in float32 would exceed the bound above."""
     op = folded(device, affine(turn(0), (60, 61), (29, 30)))
     x = noise(op.shape_in)
     truth = expected(op, x, *psfs())

@@ -1,4 +1,4 @@
-"""What every operator between two pixel grids promises, whichever way it does its sums."""
+"""Promises of every operator between two pixel grids, however it computes its sums."""
 
 import numpy as np
 import pytest

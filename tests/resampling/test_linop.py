@@ -1,4 +1,4 @@
-"""What every operator does with its caller's arrays, and the checks of testing.py themselves."""
+"""Every operator's use of its caller's arrays, and the checks of testing.py themselves."""
 
 import numpy as np
 import pytest

@@ -38,7 +38,7 @@ def of_terms(device, mapping, widths, dtype):
 
 
 def added(op, images, widths):
-    """What the operator must be: each image through its own PSF by the oracle, then the sum."""
+    """The operator by its definition: each image through its own PSF by the oracle, summed."""
     seen = expected(op, images, NARROW, PSF.gaussian(np.ravel(widths)))
     return seen.reshape(*seen.shape[:-3], *np.shape(widths), *seen.shape[-2:]).sum(axis=-3)
 

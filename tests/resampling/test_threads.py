@@ -11,7 +11,7 @@ N_THREADS, N_CALLS = 4, 60
 
 
 def in_threads(run, n_threads=N_THREADS):
-    """What `run(i)` returned in thread i, all at once."""
+    """Results of `run(i)` in thread i, all threads at once."""
     with ThreadPoolExecutor(n_threads) as pool:
         return list(pool.map(run, range(n_threads)))
 

@@ -1,4 +1,4 @@
-"""Which part of a grid others touch: overlaps without a whole mapping, and boxes of pixels."""
+"""Parts of a grid that others touch: overlaps without a whole mapping, and boxes of pixels."""
 
 import numpy as np
 import pytest

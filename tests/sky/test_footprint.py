@@ -1,4 +1,4 @@
-"""Where observed pixels lie in the model frame, and which part of it was seen."""
+"""Positions of observed pixels in the model frame, and the observed part of it."""
 
 import numpy as np
 from helpers.blends import (

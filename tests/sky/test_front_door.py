@@ -1,4 +1,4 @@
-"""What astronomers hold: coordinates, units, WCS, arrays and astropy's images, as they come."""
+"""Astronomers' own objects as arguments: coordinates, units, WCS, arrays and images."""
 
 import numpy as np
 import pytest

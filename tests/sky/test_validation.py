@@ -1,4 +1,4 @@
-"""What users give besides plain floats: honoured, or refused by name; never taken for floats."""
+"""Arguments other than plain floats are used as such or rejected by name, never as floats."""
 
 import copy
 import pickle

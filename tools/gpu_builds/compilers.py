@@ -1,4 +1,4 @@
-"""Compilers for GPUs that are absent: NVIDIA's, AMD's and Intel's, as their packages bring them."""
+"""Compilers for GPUs of NVIDIA, AMD and Intel, from their packages; no GPU is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a kernel may not take on a GPU, and what is known and kept."""
+"""Limits of a kernel's resources on a GPU, and accepted exceptions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ KEPT = "kept: "
 
 @dataclass(frozen=True)
 class Kept:
-    """What a kernel may take all the same, and why.
+    """An accepted exception: resources that a kernel may take beyond the limits, with the reason.
 
     target: "" for any; spill, stack [bytes]: at most
     """
@@ -55,7 +55,7 @@ def is_fault(words):
 
 
 def faults_of(row):
-    """What is wrong with a kernel on a target, in words; those that begin with KEPT are known."""
+    """Faults of a kernel on a target, in words; accepted ones begin with KEPT."""
     one, found = row.resources, []
     kept = KEPT if any(entry.holds(row) for entry in KEPT_KERNELS) else ""
     if one.spill:

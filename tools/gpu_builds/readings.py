@@ -1,4 +1,4 @@
-"""What compilers for GPUs say that a kernel takes, read from their words."""
+"""Resources of kernels, read from the reports of compilers for GPUs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ INTEL_REGISTER_BYTES = 64
 
 @dataclass(frozen=True)
 class Resources:
-    """What one kernel takes on one target.
+    """Resources of one kernel on one target.
 
     registers: of a work-item; on AMD vector registers, on Intel those of a thread
     spill, stack [bytes]: of a work-item: registers kept in memory; all private memory, spills
@@ -90,6 +90,6 @@ def read_intel(info, words):
 
 
 def warnings_of(words):
-    """What a compiler warned of, but for the libraries' names of the target."""
+    """Warnings of a compiler, without those about the names of the target's libraries."""
     noise = re.compile(r"linking module|Linking two modules|-Wlinker-warnings|compiled SIMD")
     return sorted({w for w in re.findall(r"warning: (.+)", words) if not noise.search(w)})

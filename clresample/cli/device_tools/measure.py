@@ -10,9 +10,9 @@ from ...device.contraction import Contraction, MatrixBatch, row_stride
 
 # (m, k, n), batch: products of a joint Euclid and Rubin fit of 118 x 118 model pixels.
 SHAPES = (((118, 118, 132), 24), ((132, 118, 132), 24), ((60, 74, 80), 48), ((74, 60, 80), 48))
-COPY_BYTES = 256 << 20  # more than any cache, and an instant on any device
+COPY_BYTES = 256 << 20  # larger than any cache, and copied in a fraction of a second
 N_LAUNCHES = 200
-# Single-precision lanes of a compute unit of NVIDIA's, by the major and minor compute capability.
+# Single-precision lanes of an NVIDIA compute unit, by (major, minor) compute capability.
 NVIDIA_LANES = {(7, 0): 64, (7, 5): 64, (8, 0): 64}
 LANES = {"NVIDIA": 128, "AMD": 64, "ADVANCED MICRO DEVICES": 64}
 
@@ -73,7 +73,7 @@ class ProductTimer:
             self.kept += [a, b, c]
 
     def __call__(self):
-        """All of them once, until they are done."""
+        """Runs every product once and waits for the device."""
         for product, batch, _ in self.runs:
             product(batch)
         self.device.finish()

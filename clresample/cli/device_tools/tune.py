@@ -28,7 +28,7 @@ CPU_TILES = [
         (8, 1, 6), (8, 1, 8), (8, 2, 4), (8, 2, 6),
     )
 ]  # fmt: skip
-# Of contract_group.cl with KB, else of contract.cl.
+# Tiles with KB are macros of contract_group.cl, the last one of contract.cl.
 GPU_TILES = [
     {"VW": 4, "NV": vectors, "MR": rows, "WGX": wide, "WGY": high, "KB": slab}
     for vectors, rows, wide, high, slab in (
@@ -161,10 +161,11 @@ def _best(device, dtype, known, name, candidates, make, bar):
 
 
 def _duel(device, dtype, now, better):
-    """The fraction of the time that the better one saves, each (sizes, work), in turn.
+    """The fraction of the present sizes' time that the better ones save.
 
-    It is the smaller of the savings in the shortest and in the median time. On a machine with other
-    work, the shortest time alone would favour a size measured in a quiet moment.
+    now, better: (sizes, work), timed alternately. The result is the smaller of the savings in the
+    shortest and in the median time. On a machine with other work, the shortest time alone would
+    favour a size measured in a quiet moment.
     """
     import numpy as np
 
@@ -177,7 +178,7 @@ def _duel(device, dtype, now, better):
 
 
 def row_choices(tile):
-    """Alternative numbers of rows of a tile: on GPUs, those next to its own."""
+    """Numbers of rows that `Tuning.tile_for` may choose from; none for tiles without KB."""
     return [tile["MR"] - 2, tile["MR"], tile["MR"] + 2] if "KB" in tile else []
 
 

@@ -1,4 +1,4 @@
-"""Options of `clresample simulate`: the sky that is drawn and its images."""
+"""Options of `clresample simulate field`: the simulated sky and its images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..options import name_list, non_negative_integer, positive_number
 
 
 def _up_to(largest, said):
-    """An option's type: a number from 0 to `largest`, which a message names by `said`."""
+    """An option's type: a number from 0 to `largest`; `said` is that range in error messages."""
 
     def convert(text):
         try:
@@ -57,9 +57,9 @@ def add_sky(sky):
         help="sources per square arcminute to i = 26 (36; real: as published)",
     )
     for name, default, said, what in (
-        ("clustering", 0.2, "0.2", "part of the sources beside another one"),
-        ("stars", None, "0.05; real: as published", "part of the sources that are stars"),
-        ("psf-variation", 0.1, "0.1", "by which part PSFs widen across the field"),
+        ("clustering", 0.2, "0.2", "fraction of the sources that lie close to another one"),
+        ("stars", None, "0.05; real: as published", "fraction of the sources that are stars"),
+        ("psf-variation", 0.1, "0.1", "relative growth of PSF widths across the field"),
     ):
         sky.add_argument(
             f"--{name}", type=_part, default=default, metavar="F", help=f"{what} ({said})"
@@ -96,6 +96,6 @@ def add_images(images):
         "--spoilers",
         type=_size,
         metavar="F",
-        help="sizes of the images' faults in units of the usual ones: offsets of WCS, wrong PSFs, "
-        "sky left in, cosmic rays, chip gaps; 0 = none (real: 1, bright: saturation alone)",
+        help="factor of the sizes of the images' faults: offsets of WCS, wrong PSFs, residual sky, "
+        "cosmic rays, chip gaps; 1 = as in surveys, 0 = none (real: 1, bright: saturation alone)",
     )

@@ -6,8 +6,7 @@ import numpy as np
 
 # Fraction of a source's variance cancelled by its covariance with another source in the sum of
 # both, above which its error is dominated by the division of their light. For two equal sources it
-# means a
-# correlation of -0.8: their difference then has three times the error of their sum.
+# means a correlation of -0.8: their difference then has three times the error of their sum.
 EXCHANGED = 0.8
 # Smallest relative error of the flux of an ambiguous source: with two such errors the flux is half
 # as large, or larger by a half.

@@ -14,7 +14,8 @@ class MissingSource(ValueError):
 def chosen_sources(result, source) -> tuple[int, ...]:
     """Numbers of the sources selected by a number, a name, or a sequence of these.
 
-    A number outside the sources' range is looked up among their names, as those of fields are.
+    A number outside the sources' range is looked up among their names, as fields name their sources
+    by numbers.
     Raises ValueError for an unknown source and for an empty sequence.
     """
     one = isinstance(source, (str, numbers.Integral)) or np.ndim(source) == 0

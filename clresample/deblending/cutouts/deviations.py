@@ -22,8 +22,8 @@ from ...sky.box import intersect_boxes
 from ...sky.psf_checks import PSFWarning
 from .separation import component_image, source_image
 
-# [FWHM of the observation's PSF] Margin of the window in the frame, for components outside it: 1e-3
-# of a morphology's light lies further away, and of its changes even less.
+# [FWHM of the observation's PSF] Margin around the window in which components' changes are
+# rendered: less than 1e-3 of a morphology's light reaches the window from further away.
 REACH_FWHM = 3.0
 
 
@@ -97,7 +97,7 @@ def _frame_part(result, i_observation, window):
 
 
 def _of_fluxes(result, chosen, i_observation, window):
-    """Computes the deviations from covariances of fluxes, or of spectra without Errors."""
+    """Computes the deviations from covariances of fluxes; without Errors, of spectra."""
     channels = result.channel_slices()[i_observation]
     n_y, n_x = (part.stop - part.start for part in window)
     units, owners, covariance = [], [], []

@@ -4,15 +4,15 @@ With the data d (its sky subtracted), the model t of the chosen sources and u of
 
     data           d - u                 model        t
     residual       d - t - u             neighbours   u
-    redistributed  d max(t, 0) / sum of max(model, 0) over all sources
+    redistributed  d f,   f = (sum of max(model, 0) over the chosen) / (the same sum over all)
 
 so that data = model + residual. The error of `data` against the light of the chosen sources is
 
     <(d - u - t_true)^2> = 1 / w - var(u) - 2 cov(t, u),
 
-with the posterior covariance of t and u. The uncertainty of the neighbours is in var(u). Noise that
-their model followed is no longer part of d - u. Where light could belong to either, cov(t, u) is
-negative and the error grows. The error is never below the noise.
+with the posterior covariance of t and u. var(u) is subtracted because u was fitted to the same
+data: u follows their noise, and d - u contains less of it. Where light could belong to either,
+cov(t, u) is negative and the error grows. `Separation.variance` is never below the noise, 1 / w.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-OUTSIDE = {"weights": 0.0}  # of an image: all else is NaN there
+# Values of a Separation's arrays in pixels outside the image; NaN in all other arrays.
+OUTSIDE = {"weights": 0.0}
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
 # [1] of a channel's brightest model pixel: if all models are fainter, a pixel's light is assigned
 # to no source, because the rounding of float32 renderings (1e-6) would decide.
@@ -52,9 +53,10 @@ class Separation:
     fraction_variance: np.ndarray
 
     def image(self, what) -> np.ndarray:
-        """One of KINDS (C, Ny, Nx) [counts]; NaN where it needs data that have no weight.
+        """Image (C, Ny, Nx) [counts] of one of KINDS.
 
-        Raises ValueError for another kind.
+        Kinds that include the data are NaN in pixels without weight. Raises ValueError for another
+        kind.
         """
         check_kind(what)
         data = np.where(self.weights > 0, self.data, np.nan)
@@ -91,7 +93,7 @@ class Separation:
     def padded(self, origin, shape) -> Separation:
         """The same Separation on a larger window, without data or models in the added pixels.
 
-        The window has `shape` (2,) [px] and begins `origin` (2,) [px] before this one.
+        shape (2,) [px]: of the larger window; origin (2,) [px]: this window's first pixel in it
         """
         n_y, n_x = self.data.shape[1:]
         sides = [(before, size - before - n) for before, size, n in
@@ -118,10 +120,11 @@ def separation_of(data, weights, images, chosen, deviations, faintest=None, *, j
     chosen: the selected sources, a set or sequence
     deviations: own and others (K, C, Ny, Nx) [counts], changes of the two models, whose sums of
         squares over K are their variances
-    joint: True if sums of products are their covariances. Otherwise these are unknown, and var(u)
-        is added to the noise, which assumes that light moves from u to t
-    faintest (C,) [counts]: models below this share no pixel; None = MIN_LIGHT_FRACTION of the
-        brightest pixel of the window
+    faintest (C,) [counts]: a pixel's light is divided between sources only if their models exceed
+        this together; None = MIN_LIGHT_FRACTION of the brightest pixel of the window
+    joint: True if the sums over K of own times others are covariances of the two models. If False,
+        these are unknown. cov(t, u) = -var(u) is then assumed (light that u lacks is in t), so that
+        var(u) is added to the noise
     """
     own, others, own_shared, shared = np.zeros((4, *data.shape))
     for source, image in images.items():
@@ -139,7 +142,7 @@ def separation_of(data, weights, images, chosen, deviations, faintest=None, *, j
     added = others_variance
     if joint:
         added = np.maximum(-others_variance - 2 * (own_change * others_change).sum(axis=0), 0)
-    # of t / (t + u): d(t / (t + u)) = (u dt - t du) / (t + u)^2
+    # change of the fraction: d(t / (t + u)) = (u dt - t du) / (t + u)^2
     over = fraction_of(np.ones(shared.shape), shared, faintest)
     change = ((1 - fraction) * own_change - fraction * others_change) * over
     return Separation(
@@ -215,7 +218,7 @@ def component_image(rendered, i, window):
 
 
 def faintest_light(total) -> np.ndarray:
-    """Light (C,) [counts] below which models share no pixel.
+    """Light (C,) [counts] of all models below which a pixel is divided between no sources.
 
     total (C, My, Mx): of all models on the whole image.
     """

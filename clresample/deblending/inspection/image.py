@@ -27,7 +27,7 @@ class InspectedImage:
 
     observation: Observation; usable (C, My, Mx): bool, pixels with a weight
     sigma (C,) [counts]: noise of a typical pixel, 1 of channels without a weight
-    level (C,) [counts]: of the sky; 0 before `levels.sky_levels`
+    level (C,) [counts]: of the sky; 0 before `levels.sky_level`
     places (S, 2) [px]: of the sources; inside (S,): bool, those on a pixel of the image
     matrix (2, 2), offset (2,): p = matrix X + offset, from model pixels to observed ones
     """

@@ -33,8 +33,7 @@ def pair_ratios(psf) -> np.ndarray:
         kappa_y = min_x [P(1 - x) + P(-1 - x)] / P(-x),    x: position of a point in its pixel
 
     Along y and along x, for the PSF made narrower by a quarter. Non-negative light convolved with
-    the
-    PSF has at least this ratio everywhere: a pixel with less is not light from the sky.
+    the PSF has at least this ratio everywhere: a pixel with less is not light from the sky.
     """
     places = NARROWER * (PHASES[:, None] + [-1.0, 0.0, 1.0]).ravel()
     n = len(PHASES)

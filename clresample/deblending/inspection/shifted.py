@@ -26,7 +26,7 @@ MAX_ERROR_PX = 0.5
 
 
 def disagreements(images, found, fit_shifts):
-    """Shifts (n_observations, 2) [model px] that align disagreeing observations, the first at rest.
+    """Shifts (n_observations, 2) [model px] that align disagreeing observations; 0 for the first.
 
     None without disagreement. Also returns a sentence on each, and on channels that disagree.
 

@@ -30,11 +30,10 @@ SHAPE_MODES = np.arange(-8, -4)
 # A box ends where its profile is below the noise of a pixel. Light beyond the box is summed on
 # every side up to half of the box's side, at most FAR_PX: for a galaxy of signal to noise 10 this
 # region has 1 % of the light and changes the size by 4 %. For a profile with wings the region
-# extends inside the
-# frame until only FAR_LIGHT of the light is left: de Vaucouleurs galaxies of r_e 40 to 60 px at
-# signal to noise 30 to 60 have a third of their light there (bench.ladder). There HALO is
-# multiplied by
-# FAR_HALO: with twice as much the coverage of simulated galaxies' sizes is 0.02 higher.
+# extends inside the frame until only FAR_LIGHT of the light is left: de Vaucouleurs galaxies of r_e
+# 40 to 60 px at signal to noise 30 to 60 have a third of their light there (bench.ladder). There
+# HALO is multiplied by FAR_HALO: with twice as much the coverage of simulated galaxies' sizes is
+# 0.02 higher.
 FAR_PX, FAR_LIGHT, FAR_HALO = 24, 0.003, 0.2
 
 

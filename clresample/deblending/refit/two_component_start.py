@@ -1,8 +1,8 @@
 """Starting models of two-component fits: of three candidates the one with the lowest chi2.
 
 For a bulge with a disc, smooth profiles of two components are the best start. In a merger they
-would
-lose most of the fitted structure: there the fitted component is kept, and a core is added to it.
+would lose most of the fitted structure: there the fitted component is kept, and a core is added to
+it.
 """
 
 from __future__ import annotations

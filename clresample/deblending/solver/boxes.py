@@ -28,7 +28,7 @@ class Boxes:
         falls and is symmetric; default (shape - 1) // 2
     offset (S,): first element in the flat buffer, a multiple of ALIGN; set here
     size: elements of the flat buffer
-    ValueError: arrays disagree, a box is empty or a centre lies outside its box
+    Raises ValueError if arrays disagree, a box is empty or a centre lies outside its box.
     """
 
     scene: np.ndarray

@@ -31,7 +31,7 @@ def box_around(profile, position, brightness):
     """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
 
     profile (Ny, Nx): over the frame; position (2,) [px]; brightness: its peak over the noise of a
-    model pixel, in the channel that sees it best
+    model pixel, in the channel of highest signal to noise
     """
     threshold = box_threshold(brightness) * profile.max()
     top = np.array(profile.shape) - 1

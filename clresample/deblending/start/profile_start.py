@@ -8,10 +8,9 @@ every instrument, so that a source detected by a single instrument starts correc
 
 The prior on theta, and the factor `contamination` for sources with neighbours, are in
 population.py. Residuals of smooth profiles are a tenth of a bright galaxy's light. The weights
-include them, 1/w = sigma^2 + (MODEL_ERROR * light)^2, so that faint neighbours do not fit spiral
-arms. The light
-is that of the smoothed data, so that weights do not depend on the profiles: with weights from the
-model, chi2 would decrease with the flux of the model.
+include them, 1/w = sigma^2 + (MODEL_ERROR * light)^2, so that profiles of faint neighbours are not
+fitted to its spiral arms. The light is that of the smoothed data, so that weights do not depend on
+the profiles: with weights from the model, chi2 would decrease with the flux of the model.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from .linearised_scenes import linearise
 from .profile_fit import ProfileFit
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
-# and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4; with the
-# operator's own precision and reach it takes three times as long.
+# and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
+# operator's own precision and reach, the start takes three times as long.
 PRECISION, TOLERANCE = Precision(1e-4, KaiserBessel(6, 1.5)), 1e-4
 # [sigma] Smallest signal to noise of light at a source: noise reaches it once in 740 times; sources
-# of `detect` have 5. A source is far from any light if neither its expected profile reaches it, nor
-# a galaxy NEARBY times larger than expected, with a sigma of 1.5": a faint source beside others is
-# probably real.
+# of `detect` have 5. A source is far from any light if neither its expected profile reaches this,
+# nor a profile NEARBY times larger (a sigma of 1.5"). The second test spares faint sources beside
+# others, which are probably real.
 LIGHT_SIGMAS, NEARBY = 3.0, 6.0
 
 
@@ -82,10 +81,7 @@ class StartingPoint:
         return len(self.shapes)
 
     def stars(self):
-        """List of point sources: StarProfile, number of its source, place (2,) [px].
-
-        spectrum (C,).
-        """
+        """Point sources, a list of (StarProfile, its source, position (2,) [px], spectrum (C,))."""
         spectra = self.spectra / self.peaks[:, None]
         rows = zip(self.shapes, self.source, self.positions[self.source], spectra, strict=True)
         return [row for row in rows if isinstance(row[0], StarProfile)]
@@ -98,7 +94,7 @@ class StartingPoint:
         return image[0] / self.peaks[i]
 
     def reach(self, i, threshold):
-        """Middle (2,) and half size (2,) [px] of its pixels above a part of its peak."""
+        """Middle (2,) and half size (2,) [px] of component i above a fraction of its peak."""
         return self.shapes[i].bounding_box(self.thetas[i], self.drawn_positions[i], threshold)
 
 
@@ -123,7 +119,7 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
 
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
-    """Views whose weights hold the PSF's error in bright stars, and the start under them."""
+    """Views with the PSF's error in bright stars in their weights; the start solved with these."""
     views = allow_for_psf_error(patch.views, point.stars(), settings.psf_error)
     if all(new is old for new, old in zip(views, patch.views, strict=True)):
         return patch.views, point
@@ -131,7 +127,7 @@ def with_psf_error_weights(patch, point: StartingPoint, settings):
 
 
 def _solved_again(patch, point, fit_sky):
-    """The same profiles, with other spectra, sky and power."""
+    """The StartingPoint with spectra, sky and curvature solved again for the patch's views."""
     rows = enumerate(zip(point.source, point.shapes, point.drawn_positions, strict=True))
     components = [StartComponent(0, i, *row, patch.frame.shape) for i, row in rows]
     looking = linearise([patch.views], components, PRECISION, TOLERANCE, fit_sky=fit_sky)
@@ -149,7 +145,7 @@ def _solved_again(patch, point, fit_sky):
 
 
 def _point(patch, looking, thetas, sources, b, dark):
-    """The StartingPoint of scene b, all solved for."""
+    """The StartingPoint of scene b from the solved least squares."""
     at = np.flatnonzero(looking.scene == b)
     chosen, own, positions = [looking.components[i] for i in at], [], patch.positions.astype(float)
     peaks = np.zeros(len(at))
@@ -176,7 +172,8 @@ def _point(patch, looking, thetas, sources, b, dark):
 def profile_peak(shape, theta, place, center, frame):
     """The largest pixel of a ComponentProfile's profile of unit integral in its frame.
 
-    place, center (2,) [px]: its position, and a position near that pixel; frame (2,) [px]
+    place (2,) [px]: the profile's position; center (2,) [px]: where the largest pixel is searched,
+        within 2 px; frame (2,) [px]: shape of the frame
     """
     if isinstance(shape, FixedProfile):
         return shape.peak
@@ -202,7 +199,8 @@ def _components(patches):
 def _dark(patches, sources, looking):
     """Selects sources far from any light: (S,) bool of each patch.
 
-    looking: at all components as they are expected, the sky level solved for; sources (N,): theirs
+    looking: LinearisedScenes of all components with their expected profiles, sky levels solved for
+    sources (N,): the source of each component
     """
     seen, found = looking.signal_to_noise(looking.sky), []
     for b, patch in enumerate(patches):
@@ -230,7 +228,7 @@ def _dark(patches, sources, looking):
 def _is_dark(snr):
     """Selects positions (n,) without light, from their signal to noise (n, C).
 
-    Tested are each channel, and the sum of all channels that cover the position with equal weights,
+    Tested are each channel, and the equally weighted sum of all channels that cover the position,
     which detects sources that are faint in each of many channels.
     """
     n_seen = np.maximum(np.count_nonzero(snr, axis=1), 1)

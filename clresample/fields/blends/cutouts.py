@@ -66,8 +66,8 @@ def fit_box(mosaic, grid) -> Box:
 
     If the noise is correlated, the Box has one more pixel on each side, because the whitening
     filter leaves a cutout's outer pixels without weight. Grids of one shape have Boxes of one
-    shape, so that
-    their fits share a batch without padding. The area is 0 if there are no such pixels.
+    shape, so that their fits share a batch without padding. The area is 0 if there are no such
+    pixels.
     """
     there = mosaic.edge_of(grid)
     if not len(there):

@@ -21,8 +21,8 @@ ROUNDS = 4
 # of that light.
 LARGE_ROUNDS = 1
 # [errors] A blend's pieces have settled if no flux changes by more than this between two rounds.
-# Fits end within 0.2 of the minimum (Settings.enough), two of them within 0.3 of each other, so a
-# smaller number would not be reached.
+# Fluxes of a fit end within 0.2 errors of the minimum (Settings.loss_tol), those of two fits within
+# 0.3 of each other, so a smaller number would not be reached.
 MAX_FLUX_CHANGE_SIGMA = 0.3
 # [of a flux] The same for bright sources. Pixels from which a neighbour's light is subtracted have
 # weights for an error of 15 % of that light (MODEL_ERROR). If the light changes by 0.5 %, a flux

@@ -28,7 +28,7 @@ class PiffPSF(PSFField):
     Raises FileError for a file that is not Piff's, has several detectors and none is given, or
     whose PSF depends on more than the position (a colour); ImportError without Piff; ValueError for
     an even stamp_px.
-    Source: Jarvis et al. 2021 (MNRAS 501, 1282); `piff.read`, `PSF.draw`.
+    Source: Jarvis et al. 2021 (MNRAS 501, 1282); `piff.read`, `piff.PSF.draw`.
     """
 
     path: Path

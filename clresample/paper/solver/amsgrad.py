@@ -18,7 +18,7 @@ from .scene import AmsgradMoments
 # Decay of the moments of gradients and of their squares (Reddi et al. 2018's defaults, as in the
 # paper's solver): an average over the last 10 and the last 1000 iterations.
 BETA1, BETA2 = 0.9, 0.999
-# Fraction of `Scene.damping` by which steps are damped. The damping is a bound on the curvature, in
+# Fraction of AmsgradScene.damping by which steps are damped. The damping is a bound on the curvature, in
 # most scenes twice the largest curvature (see curvature.py), so all of it would make steps too
 # short. Without damping, steps of one length for all pixels would move a bright source far away
 # from a good start.
@@ -34,8 +34,8 @@ class StepSizes:
     Larger steps approach the minimum faster and are less stable there.
 
     latent: of z, in units of the prior's scatter; morphology: of S where there is no prior, in
-    units of its maximum, 1; spectrum: in units of `Scene.step_scale`, a flux's error and 2 % of the
-    flux
+    units of its maximum, 1; spectrum: in units of `AmsgradScene.step_scale`, a flux's error and 2 %
+    of the flux
     """
 
     latent: float = 0.1

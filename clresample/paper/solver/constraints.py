@@ -73,7 +73,7 @@ class Prox:
     def prox(self, morphs, boxes, *, step=1.0, active=None, factor=None):
         """Overwrites morphs by the operator's result; see the module's text.
 
-        ValueError: morphs or factor have another shape or type than the boxes require
+        Raises ValueError if morphs or factor have another shape or type than the boxes require.
         """
         n_sources = len(boxes)
         if morphs.shape != (boxes.boxes.size,):

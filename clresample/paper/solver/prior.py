@@ -12,8 +12,7 @@ class SingleScalePrior:
     """Prior on a morphology: S = p + alpha sqrt(p) K z, z unit normal.
 
     p is the expected smooth profile. The structure of galaxies consists of clumps, whose number,
-    and so
-    the variance, is proportional to the light: hence the root.
+    and so the variance, is proportional to the light: hence the root.
 
     strength [1]: scatter of the brightest pixel about its expected value, relative to it; larger
         ones let more of the noise into the morphology

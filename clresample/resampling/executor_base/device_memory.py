@@ -47,7 +47,7 @@ class DeviceMemory:
             self._bound_back = True
 
     def select_plans(self, which):
-        """Selects the plans `which` (items,) of the next items; reserve as many items before."""
+        """Selects the plans `which` (items,) of the next items; `reserve` must precede it."""
         self.device.upload(np.ascontiguousarray(which, np.int32), self.which[: len(which)])
 
     def cached(self, name, make):
@@ -59,7 +59,8 @@ class DeviceMemory:
     def clone(self) -> Self:
         """An executor of the same tables on the device, with intermediates of its own.
 
-        For callers that work between its stages. A shift of one executor applies to both.
+        For callers that use the intermediates between two products of the chain. Both executors
+        have the same pixel shift: setting it in one sets it in the other.
         """
         other = copy.copy(self)
         other.n_reserved, other.scratch, other._bound_back = 0, {}, False
@@ -68,9 +69,10 @@ class DeviceMemory:
     def reserve(self, n_images):
         """Makes room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
-            # until all are bound, so that an interruption leaves a consistent state
+            # 0 until all products are bound, so that an interruption leaves a consistent state
             self.n_reserved, self._bound_back = 0, False
-            # items with sizes of their own leave the rest unwritten; sums may read it with weight 0
+            # items with sizes of their own do not fill their matrices; sums may read the elements
+            # beyond with weight 0, so these must be finite
             make = self.device.empty if self.which is None else self.device.zeros
             self.scratch = {
                 name: make((n_images, rows, ld), self.dtype)
@@ -87,7 +89,10 @@ class DeviceMemory:
         )
 
     def tables(self, array):
-        """Tables (plans or items, bands, ...) of an epilogue: arguments of `Contraction.bind`."""
+        """Argument `e` of `Contraction.bind`: buffer, stride and band stride of its tables.
+
+        array (plans or items, bands, ...): the tables that the products are multiplied by
+        """
         stride = math.prod(array.shape[1:]) if len(array) > 1 else 0
         return array.base_data, stride, math.prod(array.shape[2:])
 

@@ -17,8 +17,8 @@ class MultiscalePrior:
     p is the expected smooth profile, K_j a Gaussian kernel of unit variance, and z_j is normal with
     scatter strength_j, which starts at `strengths` and is estimated for each source and scale. The
     structure of galaxies consists of clumps, whose number, and so the variance, is proportional to
-    the
-    light: hence the root. The projection on the profile is subtracted, since the spectrum fits it.
+    the light: hence the root. The projection on the profile is subtracted, since the spectrum fits
+    it.
 
     scales_px [model px]: Gaussian sigmas of the kernels, ascending: the model PSF's own width,
         galaxies' clumps, their wings

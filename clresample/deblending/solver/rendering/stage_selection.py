@@ -14,9 +14,8 @@ from .windows import WindowGroups, WindowRendering, reach_of
 # Cost of an operation relative to one of a large product: first in a product of the size of a box,
 # whose tiles are cut by the box and whose sums are short; then in a sum over sources or bands,
 # which loads all its factors from memory. Fitted to processor times on one CPU with AVX-512 (1.7
-# and 12 on
-# other scenes): the selected stage then takes at most 8 % more time than the fastest. With larger
-# values frames are selected more often.
+# and 12 on other scenes): the selected stage then takes at most 8 % more time than the fastest.
+# With larger values frames are selected more often.
 BOX_COST, SUM_COST = 1.9, 10.0
 # Numbers of cells along a side of a frame that are tried for windows, and the largest ratio of
 # their operations to those of frames. The count is an estimate, and small products, cutting and
