@@ -56,6 +56,7 @@
  *   local size.
  */
 #define ON_CPU 1
+#define RAGGED ragged       /* one build for both, see contract.h */
 #include "prefetch.h"
 #if READ_AHEAD
 #define PREFETCH_B(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
@@ -91,7 +92,7 @@ void contract(int m, int n, const int n_pad, int k, const int block,
               __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
               const int stride_c,
               __global const REAL *restrict E, const int stride_e, const int band_e,
-              const int n_bands, const int epilogue, const int sign,
+              const int n_bands, const int epilogue, const int sign, const int ragged,
               __global const int *restrict which, __global const int *restrict own)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;

@@ -28,10 +28,12 @@
 
     EACH(i, MR) EACH(v, NV) {
         if (!OWNED(i, v)) continue;
-#if RAGGED
-        __global REAL *c = C + (size_t)(i0 + i) * ld_c + (size_t)column[v] * step_c;
-        STORE_LANES(SUMS[i][v], c, n - column[v])
-#else
-        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = SUMS[i][v];
+#if ON_CPU || RAGGED
+        if (RAGGED) {
+            __global REAL *c = C + (size_t)(i0 + i) * ld_c + (size_t)column[v] * step_c;
+            STORE_LANES(SUMS[i][v], c, n - column[v])
+            continue;
+        }
 #endif
+        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = SUMS[i][v];
     }

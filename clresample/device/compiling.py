@@ -26,33 +26,21 @@ class CompilationNotice:
 
     def __init__(self, device):
         self.device, self._lock = device, threading.Lock()
-        self._launched: set[int] = set()
         self._n_built = self._n_waiting = 0
         self._began, self._bar = time.monotonic(), None
 
     def build(self, build):
         """Returns `build()`, and counts it if it took longer than a cached build."""
-        with self._shown():
+        with self.shown():
             began = time.thread_time()
             built = build()
             if time.thread_time() - began > MAX_CACHED_S:
                 self._count()
         return built
 
-    def wait_for_first_launch(self, kernel, finish):
-        """Calls `finish()` after the first launch of a kernel: drivers for CPUs compile it there.
-
-        Only where the wait is shown.
-        """
-        if not self._n_built or not is_watched() or kernel.int_ptr in self._launched:
-            return
-        self._launched.add(kernel.int_ptr)
-        with self._shown():
-            finish()
-
     @contextmanager
-    def _shown(self):
-        """Draws the count meanwhile; threads that compile at the same time share it."""
+    def shown(self):
+        """Draws the count during a build or a first launch; threads share it."""
         with self._lock:
             self._n_waiting += 1
             if self._n_built and self._bar is None and is_watched():

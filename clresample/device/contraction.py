@@ -158,7 +158,7 @@ class Contraction:
     ):
         self.device, self.dtype = device, dtype
         self.tuning = tuning or Tuning.of(device, dtype)
-        self.options = {"RAGGED": ragged, "STRIDED": strided}
+        self.ragged, self.options = ragged, {"STRIDED": strided}
         self.epilogue, self.sign = epilogue, -1 if adjoint else 1
 
     def build(self, n_rows=None, n_terms=0, n=0):
@@ -169,6 +169,7 @@ class Contraction:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
             return FILE, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
         stage = {"SIGN": self.sign} | ({self.epilogue: True} if self.epilogue else {})
+        stage["RAGGED"] = self.ragged
         return GROUP_FILE, self.options | stage | tile | {"TWO_SUMS": two_sums}
 
     def bind(
@@ -197,9 +198,8 @@ class Contraction:
         whole_a = a.step == 1 and a.stride == m * a.ld and a.items_per_matrix == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, n)
-        stage = {"epilogue": EPILOGUES.index(self.epilogue), "sign": self.sign}
         if "KB" in tile:
-            tile, stage = tile | {"OWN": own is not None}, {}
+            tile = tile | {"OWN": own is not None}
         which = own and own.table_index
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
@@ -234,7 +234,7 @@ class Contraction:
             n_bands=n_bands,
             which=which,
             own=sizes,
-            **stage,
+            **self._stage(file),
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
         return BoundContraction(launch, tile, m, self._extent(tile, n), starts if tall else None)
@@ -242,6 +242,13 @@ class Contraction:
     def _extent(self, tile, n):
         """Rows and columns of C computed by one work-item, and columns computed by all."""
         return tile["MR"] * tile.get("RT", 1), tile["NV"] * tile["VW"], round_up_columns(n)
+
+    def _stage(self, file):
+        """Arguments of the kernels for CPUs, which are macros of the one for GPUs."""
+        if file == GROUP_FILE:
+            return {}
+        stage = {"epilogue": EPILOGUES.index(self.epilogue), "sign": self.sign}
+        return stage | ({"ragged": self.ragged} if file == FILE else {})
 
     def _order(self, k, inward):
         """The order in which the kernel sums k terms, as its arguments."""

@@ -190,8 +190,13 @@ class Device:
 
     def launch(self, kernel, global_size, local_size=None):
         """Queues a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
-        event = self._call(self._enqueue, self.queue, kernel, global_size, local_size)
-        self._programs.notice.wait_for_first_launch(kernel, self.finish)
+        arguments = self._enqueue, self.queue, kernel, global_size, local_size
+        program = self._programs.unlaunched(kernel)
+        if program is None:
+            return self._call(*arguments)
+        with self._programs.compiling(program):
+            event = self._call(*arguments)
+            self.finish()
         return event
 
     def finish(self, queue=None):

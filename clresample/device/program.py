@@ -6,11 +6,12 @@ import functools
 import re
 import threading
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
+from .build_lock import build_lock
 from .compiling import CompilationNotice
 from .discovery import DeviceError, load_pyopencl
 from .errors import build_error, float64_error
@@ -84,6 +85,7 @@ class Programs:
     def __init__(self, device):
         self.device = device
         self._programs, self._kernels = {}, {}
+        self._not_launched: dict[int, str] = {}  # {id of a kernel: its program}
         self.notice = CompilationNotice(device.name)
 
     def kernel(self, file, name, dtype, defines):
@@ -102,8 +104,23 @@ class Programs:
             kernel, types = cl.Kernel(program, name), SCALARS | {"REAL": dtype.type}
             kernel.set_scalar_arg_dtypes([types.get(type_) for _, type_ in arguments])
             is_buffer = {argument: type_ is None for argument, type_ in arguments}
+            if self.device.kind == "CPU":  # drivers for CPUs compile at the first launch
+                self._not_launched[id(kernel)] = self._lock_name(build)
             self._kernels[build, name] = kernel, is_buffer
         return self._kernels[build, name]
+
+    def unlaunched(self, kernel):
+        """Returns the program of a kernel that has not been launched yet, once, or None."""
+        return self._not_launched.pop(id(kernel), None) if self._not_launched else None
+
+    @contextmanager
+    def compiling(self, program):
+        """Excludes other processes that compile the same program, and shows the wait."""
+        with self.notice.shown(), build_lock(program):
+            yield
+
+    def _lock_name(self, build):
+        return f"{self.device!r} {build}"
 
     def build_ahead(self, requests):
         """Starts building programs in a thread; `kernel` waits for one in progress.
@@ -139,7 +156,8 @@ class Programs:
             raise float64_error(device)
         program = cl.Program(device.context, source_of(file, dtype, defines))
         try:
-            return self.notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
+            with self.compiling(self._lock_name(_request(file, dtype, defines))):
+                return self.notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
         except cl.Error as error:
             raise build_error(device, file, defines, build_log(error)) from error
 
