@@ -8,33 +8,44 @@ from astropy.table import Table
 
 from ..deblending.posterior.block_matrix import BlockCholesky
 from ..deblending.posterior.errors import PosteriorSampler
+from ..deblending.posterior.mode_images import CellImages, ModeImages
 from ..deblending.solver.rendering.ties import Ties
 from .array_hdus import array_of, image_hdu
 
-NODES = ("n_modes", "size", "order", "n_later")
+NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel")
 
 
 def draw_hdus(draws):
     """HDUs of a PosteriorSampler; an empty list for None.
 
     DRAWNODES: a row for each node of the matrix: its modes, unknowns, position in the elimination
-    order, and number of neighbours that are eliminated later. DRAWLATER: these neighbours.
-    DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated; the factor consists of each node's
-    diagonal block and the block below it, in elimination order. DRAWUNIT, DRAWWIDE, DRAWBANDS: see
-    PosteriorSampler.
+    order, and number of neighbours that are eliminated later; how many of the modes are smooth, and
+    their pixels, see ModeImages. DRAWLATER: these neighbours.
+    DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated, smooth modes first; the factor
+    consists of each node's diagonal block and the block below it, in elimination order. DRAWUNIT,
+    DRAWWIDE, DRAWBANDS: see PosteriorSampler.
     """
     if draws is None:
         return []
     factor = draws.factor
     n_nodes = len(factor.sizes)
     counts = [len(images) for images in draws.modes] + [0] * (n_nodes - len(draws.modes))
-    rows = np.stack([counts, factor.sizes, factor.order, [len(x) for x in factor.later]], axis=1)
+    rows = np.zeros((n_nodes, len(NODES)), np.int64)
+    n_later = [len(nodes) for nodes in factor.later]
+    rows[:, :4] = np.column_stack([counts, factor.sizes, factor.order, n_later])
+    arrays = []
+    for row, images in zip(rows, draws.modes, strict=False):
+        if isinstance(images, ModeImages):
+            row[4:] = len(images.smooth), images.smooth.pixel
+            arrays += [images.smooth.values, images.sharp]
+        else:
+            arrays.append(images)
     later = [node for nodes in factor.later for node in nodes]
     bands = () if draws.ties is None else draws.ties.bands
     return [
-        fits.BinTableHDU(Table(rows.astype(np.int64), names=NODES), name="DRAWNODES"),
+        fits.BinTableHDU(Table(rows, names=NODES), name="DRAWNODES"),
         image_hdu("DRAWLATER", np.array(later, np.int64)),
-        image_hdu("DRAWMODES", _flat(draws.modes, np.float32)),
+        image_hdu("DRAWMODES", _flat(arrays, np.float32)),
         image_hdu("DRAWSCALE", _flat(factor.scale, np.float64)),
         image_hdu("DRAWFACTOR", _flat(factor.blocks(), np.float64)),
         image_hdu("DRAWUNIT", draws.unit),
@@ -51,7 +62,7 @@ def read_draws(hdus, shapes):
     if "DRAWNODES" not in hdus:
         return None
     table = hdus["DRAWNODES"].data
-    counts, sizes, order, n_later = (table[name].astype(np.int64) for name in NODES)
+    counts, sizes, order, n_later, *smooth = (table[name].astype(np.int64) for name in NODES)
     ends = np.cumsum(n_later)[:-1]
     later = [part.tolist() for part in np.split(array_of(hdus["DRAWLATER"]), ends)]
     modes = _ArrayReader(array_of(hdus["DRAWMODES"]))
@@ -63,7 +74,7 @@ def read_draws(hdus, shapes):
             below[v] = factor.take(sum(sizes[u] for u in later[v]), sizes[v])
     bands = array_of(hdus["DRAWBANDS"])
     return PosteriorSampler(
-        [modes.take(n, *shape) for n, shape in zip(counts, shapes, strict=False)],
+        [_modes(modes, *given) for given in zip(shapes, counts, *smooth, strict=False)],
         BlockCholesky.restore(
             sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below
         ),
@@ -71,6 +82,14 @@ def read_draws(hdus, shapes):
         array_of(hdus["DRAWWIDE"]),
         Ties(tuple(bands.tolist())) if len(bands) else None,
     )
+
+
+def _modes(arrays, shape, count, n_smooth, pixel):
+    """The modes of a component from an _ArrayReader, an array or ModeImages."""
+    if not pixel:
+        return arrays.take(count, *shape)
+    smooth = CellImages(arrays.take(n_smooth, *(-(-n // pixel) for n in shape)), int(pixel))
+    return ModeImages(smooth, arrays.take(count - n_smooth, *shape))
 
 
 def _flat(arrays, dtype):

@@ -121,7 +121,7 @@ def test_neighbours_are_those_whose_rows_meet(monkeypatch):
 
     class Watched(_NormalAccumulator):
         def _seen(self, i, images, spectrum, origin, low, high):
-            return SimpleNamespace(i=i, low=low, high=high, light=0)
+            return SimpleNamespace(i=i, low=low, high=high, light=0, cell=1)
 
         def _add(self, one, other, *_):
             pairs.append((one.i, other.i))
@@ -132,5 +132,5 @@ def test_neighbours_are_those_whose_rows_meet(monkeypatch):
     )
     layout = SimpleNamespace(shift=lambda _: None, n_sky=0, spectra_at=lambda c: c)
     images, spectra = [np.zeros((1, 2, 2))] * 4, np.ones((4, 1))
-    Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, spectra)
+    Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, [None] * 4, spectra)
     assert sorted(pairs) == [(0, 0), (0, 1), (1, 1), (2, 2)]

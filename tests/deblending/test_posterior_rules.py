@@ -229,7 +229,7 @@ def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():
     for peak in (1.0, 2.0):
         one = solution([(5, 5)], [box], fixed=(0,), peaks=peak)
         one.shapes[0], one.thetas[0], one.positions[0] = shape, theta, place
-        beyond.append(one.modes(0)[1].sums)
+        beyond.append(one.modes(0)[2].sums)
     np.testing.assert_allclose(beyond[0], 2 * beyond[1])
 
 
@@ -269,7 +269,7 @@ def test_where_unknowns_lie():
 
 def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(monkeypatch):
     """The first image of a component is its morphology, the others are its modes."""
-    monkeypatch.setattr(posterior, "normal_matrix", lambda *given: given[-1])
+    monkeypatch.setattr(posterior, "normal_matrix", lambda *given: given[-2])
     asked = []
     known = SimpleNamespace(block=lambda i, j: np.diag([4.0, 0.25, 1, 1, 1, 1, 1]) / 2)
     factor = SimpleNamespace(inverse=lambda: known, solve=asked.append)
@@ -278,7 +278,12 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
     one = SimpleNamespace(
         spectra=np.ones((2, 5)),
         scene=SimpleNamespace(ties=None),
-        modes=lambda i: (images[i], OutsideBoxMoments.none(len(images)), np.arange(1.0, 2 * i + 1)),
+        modes=lambda i: (
+            images[i],
+            images[i][1:],
+            OutsideBoxMoments.none(len(images)),
+            np.arange(1.0, 2 * i + 1),
+        ),
     )
     for sky, shifts in ((False, False), (True, False), (False, True), (True, True)):
         made = posterior.Posterior(one, [0, 0, 0], fit_sky=sky, fit_shifts=shifts)

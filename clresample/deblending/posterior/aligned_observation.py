@@ -11,7 +11,7 @@ sufficient band and period.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
 from ...sky.psf import PSF, crop_psf
 from ..view import WhitenedView
+from .mode_images import cell_sums, from_cells
 
 # [FWHM of the observation's PSF] Margin around its box up to which a component's light is rendered.
 # Errors of simulated Euclid and Rubin scenes differ by less than 1e-4 from those with 5; with 1, by
@@ -57,6 +58,8 @@ class AlignedObservation:
     reach_px [model px]: see REACH_FWHM; transfer: its BandLimitedTransfer
     coefficients (n, C, T): of its terms in the PSF of each component, None for one term
     n_threads: of the host, for components of MIN_THREADED_ELEMENTS elements
+    cell: rows and columns of an image that are one; images, windows and weights are then those of
+        cells, images at the cells' middles; `y` and `x` stay
     """
 
     y: np.ndarray
@@ -66,6 +69,7 @@ class AlignedObservation:
     transfer: BandLimitedTransfer
     coefficients: np.ndarray | None
     n_threads: int = 1
+    cell: int = 1
 
     @classmethod
     def of(cls, view: WhitenedView, frame, observation, source):
@@ -85,31 +89,57 @@ class AlignedObservation:
     def window(self, origin, shape):
         """First and one-past-last row and column (2, 2) within reach of a box of the frame."""
         parts = zip((self.y, self.x), origin, shape, strict=True)
-        return np.array(
+        low, high = np.array(
             [np.searchsorted(at, (o - self.reach_px, o + n - 1 + self.reach_px))
              for at, o, n in parts]
         ).T  # fmt: skip
+        return np.array([low // self.cell, -(-high // self.cell)])
+
+    def cell_for(self, pixel):
+        """The largest power of 2 of rows and columns that is no wider than `pixel` [model px]."""
+        wide = max((at[-1] - at[0]) / max(len(at) - 1, 1) for at in (self.y, self.x))
+        return 2 ** max(0, int(np.floor(np.log2(pixel / max(wide, 1e-9)))))
+
+    def in_cells(self, cell):
+        """This observation in cells of so many rows and columns, itself of one row each."""
+        power = cell_sums(np.square(self.sqrt_weights, dtype=np.float64), cell)
+        y, x = (np.pad(at, (0, -len(at) % cell), mode="reflect", reflect_type="odd")
+                for at in (self.y, self.x))  # fmt: skip
+        root = np.sqrt(power).astype(np.float32)
+        return replace(self, y=y, x=x, sqrt_weights=root, cell=cell)
+
+    def _middles(self, at):
+        return at.reshape(-1, self.cell).mean(1)
 
     def threads_for(self, images):
         """Number of threads for the images of a component."""
         return self.n_threads if images.size > MIN_THREADED_ELEMENTS else 1
 
-    def observe(self, images, i, origin, low, high):
+    def observe(self, images, i, origin, low, high, pixel=1):
         """Whitened images (k, C, ry, rx) of component i's images (k, ny, nx) in a box.
 
         The box begins at `origin` of the frame; rows and columns from `low` to `high`; float32, as
         the images are.
 
-        images: see `flush_faint`
+        images: see `flush_faint`; pixel [model px]: of the images, see CellImages
         """
-        k, n_y, n_x = images.shape
+        k, m_y, m_x = images.shape
+        n_y, n_x = m_y * pixel, m_x * pixel
         nu_y, nu_x, d = self.transfer.at((n_y, n_x), self.reach_px)
+        if pixel > 1:  # frequencies that its pixels resolve
+            rows, columns = (np.abs(nu) <= 0.5 / pixel for nu in (nu_y, nu_x))
+            nu_y, nu_x, d = nu_y[rows], nu_x[columns], d[rows][..., columns]
         if self.coefficients is not None:
             parts = self.coefficients[i]
             d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
         to_y, to_x = _waves(nu_y, -np.arange(n_y)), _waves(-np.arange(n_x), nu_x)
-        from_y = _waves(self.y[low[0] : high[0]] - origin[0], nu_y)
-        from_x = _waves(nu_x, self.x[low[1] : high[1]] - origin[1])
+        if pixel > 1:
+            to_y = to_y @ from_cells(n_y, pixel).astype(np.float32)
+            to_x = from_cells(n_x, pixel).T.astype(np.float32) @ to_x
+        ends = zip(low, high, strict=True)
+        rows, columns = (slice(self.cell * a, self.cell * b) for a, b in ends)
+        from_y = _waves(self._middles(self.y[rows]) - origin[0], nu_y)
+        from_x = _waves(nu_x, self._middles(self.x[columns]) - origin[1])
         to_y = np.concatenate([to_y.real, to_y.imag])
         from_y = np.concatenate([from_y.real, -from_y.imag], axis=1)
         root = self.sqrt_weights[:, low[0] : high[0], low[1] : high[1]]
@@ -117,8 +147,8 @@ class AlignedObservation:
 
         def observe_from(first):
             some = images[first : first + n]
-            z = to_y @ some.transpose(1, 0, 2).reshape(n_y, -1)  # (2 Hy, k nx)
-            z = (z[: len(nu_y)] + 1j * z[len(nu_y) :]).reshape(-1, n_x) @ to_x
+            z = to_y @ some.transpose(1, 0, 2).reshape(m_y, -1)  # (2 Hy, k nx)
+            z = (z[: len(nu_y)] + 1j * z[len(nu_y) :]).reshape(-1, m_x) @ to_x
             z = z.reshape(len(nu_y), len(some), 1, -1) * d[:, None]
             z = (z.reshape(-1, len(nu_x)) @ from_x).reshape(len(nu_y), -1)
             seen = from_y @ np.concatenate([z.real, z.imag])

@@ -11,6 +11,7 @@ from scipy.linalg.blas import strmm
 
 from ..solver.rendering.ties import Ties
 from .block_matrix import RIDGE, BlockCholesky
+from .mode_images import ModeImages, combined
 
 # Number of draws for the errors of cutouts, and their seed. Standard deviations have a relative
 # error of 1 / sqrt(2 N) = 0.09; the time is proportional to the number.
@@ -63,14 +64,14 @@ class Errors:
 class PosteriorSampler:
     """Means and factors from which samples of the posterior are drawn.
 
-    modes (n): (k_i, ny, nx), images of each component's modes
+    modes (n): (k_i, ny, nx), images of each component's modes, arrays or ModeImages
     factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (B,)
     unit (C,) [counts]: unit of the spectra there
     misfit_scale (n,): factor of the scatter of misfitted sources' components, as for their Errors
     ties: Ties of the channels, of B bands; None: B = C
     """
 
-    modes: list[np.ndarray]
+    modes: Sequence[np.ndarray | ModeImages]
     factor: BlockCholesky
     unit: np.ndarray
     misfit_scale: np.ndarray
@@ -89,7 +90,7 @@ class PosteriorSampler:
         returns (N_SAMPLES, ny, nx) and (N_SAMPLES, C)
         """
         images, values = self.modes[i], self.misfit_scale[i] * self.samples[i]
-        morphs = np.tensordot(values[:, : len(images)], images, 1)
+        morphs = combined(images, values[:, : len(images)])
         return morphs, self._spectra(values[:, len(images) :])
 
     def draw(self, rng):
@@ -98,7 +99,7 @@ class PosteriorSampler:
         morphs, spectra = [], []
         for values, images, wide in zip(found, self.modes, self.misfit_scale, strict=False):
             values = wide * values
-            morphs.append(np.tensordot(values[: len(images)], images, 1))
+            morphs.append(combined(images, values[: len(images)]))
             spectra.append(self._spectra(values[len(images) :]))
         return morphs, np.array(spectra)
 
@@ -135,6 +136,7 @@ class MorphologyErrors(Sequence):
 
 def _standard_deviation(images, covariance):
     """Standard deviation (ny, nx) of a sum of images (k, ny, nx); covariance (k, k) of factors."""
+    images = np.asarray(images)
     k, shape = len(images), images.shape[1:]
     if not k:
         return np.zeros(shape)

@@ -12,6 +12,7 @@ from ...sky.box import intersect_boxes
 from ..solver.multiscale.prior import MultiscalePrior
 from ..solver.scene import Scene
 from ..view import flush_faint
+from .mode_images import CellImages, ModeImages, cell_sums, subtract, sums_with
 from .profile_modes import profile_modes
 from .smooth_modes import MIN_LIGHT, SmoothModes, whitening_transform
 
@@ -126,10 +127,13 @@ class Solution:
         return out * overlap_inflation(self._light(i, i), sum(others))
 
     def modes(self, i):
-        """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes.
+        """Images, float32, of component i's morphology and of its modes.
 
-        Under the prior their coefficients are independent with unit variance. Also returns its
-        OutsideBoxMoments, and the data's gradient by each mode (k,) from pixels on the bound at 0.
+        returns images (1 + k, ny, nx) of the morphology and its modes, without smooth ones on wide
+            pixels; its modes (k, ny, nx), an array or ModeImages; its OutsideBoxMoments; and the
+            data's gradient by each mode (k,) from pixels on the bound at 0
+
+        Under the prior the modes' coefficients are independent with unit variance.
         """
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
@@ -142,25 +146,27 @@ class Solution:
         )
         scatter = scatter / self.peaks[i]
         far = far.scaled(np.append(1 / self.peaks[i], scatter))
-        n_own, own = 0, None
+        n_own, smooth = 0, None
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
             least = min(MIN_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
             given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
-            bumps = SmoothModes(*given, least_light=least)
-            keep = np.flatnonzero(self.flux_change_sigma(i, bumps.images) > MIN_CHANGE)
+            bumps = SmoothModes(*given, least_light=least, in_cells=True)
+            change = self.flux_change_sigma(i, bumps.images, bumps.pixel)
+            keep = np.flatnonzero(change > MIN_CHANGE)
             own = whitening_transform(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
-            n_own = len(own)
+            if bumps.pixel > 1:
+                smooth = np.empty((len(keep), *bumps.images.shape[1:]), np.float32)
+            else:
+                n_own = len(keep)
         seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
         seen[0], out = flush_faint(self.morphs[i].copy()), seen[1:]
-        if n_own:
-            np.take(bumps.images, keep, axis=0, out=out[:n_own])
-            flat = out[:n_own].reshape(n_own, -1)
-            # the transpose, since BLAS counts rows first; in place
-            strmm(1.0, own.astype(np.float32).T, flat.T, side=1, overwrite_b=1)
+        if not scene.fixed[i]:
+            _combine(bumps.images, keep, own, out[:n_own] if smooth is None else smooth)
         out[n_own:] = flush_faint(scatter[:, None, None] * images)
-        far = far.with_gauge(self.along(i, out) * self.peaks[i])
-        return seen, far, self._held(i, out)
+        modes = out if smooth is None else ModeImages(CellImages(smooth, bumps.pixel), out)
+        far = far.with_gauge(self.along(i, modes) * self.peaks[i])
+        return seen, modes, far, self._held(i, modes)
 
     def remove_profile_part(self, i, images):
         """Subtracts the profile's part from images, in place; returns the parts (k,).
@@ -175,8 +181,8 @@ class Solution:
     def along(self, i, images):
         """Subtracts from images, in place, their projection on the profile; returns it (k,)."""
         p = flush_faint(self.scene.profile[i].astype(images.dtype))
-        along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
-        images -= along[:, None, None] * p
+        along = sums_with(images, p[None])[0] / max((p * p).sum(), 1e-30)
+        subtract(images, along, p)
         return along.astype(np.float64)
 
     def _held(self, i, images):
@@ -184,20 +190,22 @@ class Solution:
         held = self.morphs[i] <= 0
         if self.scene.fixed[i] or not held.any():
             return np.zeros(len(images))
-        return (images[:, held] @ self.negative_chi2_gradient[i][held].astype(images.dtype)).astype(
-            np.float64
-        )
+        gradient = np.where(held, self.negative_chi2_gradient[i], 0)
+        return sums_with(images, gradient[None])[0].astype(np.float64)
 
-    def flux_change_sigma(self, i, images):
-        """Change of flux and second moment [fixed errors] by images (k, ny, nx) of scatter 1."""
+    def flux_change_sigma(self, i, images, pixel=1):
+        """Change of flux and second moment [fixed errors] by images (k, ny, nx) of scatter 1.
+
+        pixel: of the images, see SmoothModes
+        """
         m = self.morphs[i] * self.peaks[i]
         total = max(m.sum(), 1e-30)
         y, x = np.indices(m.shape)
         r2 = (y - (y * m).sum() / total) ** 2 + (x - (x * m).sum() / total) ** 2
         weight = 1 + r2 / max((r2 * m).sum() / total, 1e-9)
         significance = np.linalg.norm(self.spectra[i] / self.fixed_error[i])
-        change = images.reshape(len(images), m.size) @ weight.ravel().astype(np.float32)
-        return np.abs(change) / total * significance
+        weight = cell_sums(weight.astype(np.float32), pixel)
+        return np.abs(sums_with(images, weight[None])[0]) / total * significance
 
     def _light(self, j, i):
         """Expected light of component j on i's box, all channels in quadrature [noise]."""
@@ -234,3 +242,12 @@ class Solution:
         low, high = self._boxes
         meet = ((low < high[i]) & (high > low[i])).all(1)
         return [j for j in np.flatnonzero(meet) if j != i]
+
+
+def _combine(images, keep, weights, out):
+    """Writes combinations of the images `keep`, weights (k, k) 0 above the diagonal, to `out`."""
+    if len(keep):
+        np.take(images, keep, axis=0, out=out)
+        # the transpose, since BLAS counts rows first; in place
+        flat = out.reshape(len(out), -1)
+        strmm(1.0, weights.astype(np.float32).T, flat.T, side=1, overwrite_b=1)

@@ -3,12 +3,14 @@
 Each component's modes are rendered from its box in a window of the observation. Components with
 overlapping windows have a common block of the matrix. They are processed in the order of their
 rows, and images are dropped once no further window overlaps them: memory is proportional to the
-number of overlapping sources, not of all.
+number of overlapping sources, not of all. Smooth modes on wide pixels are rendered on cells of the
+observation's pixels, where their products with each other, and with the means of others, are
+summed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +20,7 @@ from ...sky.box import box_slices
 from ..shifts import SCATTER_PX
 from ..solver.rendering.ties import Ties
 from .block_matrix import BlockMatrix
+from .mode_images import interpolation
 
 # [1] Products of this size and more are summed in float64: in float32 their rounding error would
 # approach the prior's precision of 1. A source of signal to noise 300 has products of 1e5. With
@@ -76,13 +79,15 @@ class UnknownLayout:
         return self.n_sky + 2 * (o - 1) + np.arange(2)
 
 
-def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
+def normal_matrix(scene, exposures, images, spectra, layout, smooth=None) -> BlockMatrix:
     """J^T J + prior^-1, where sky levels have the precision of Scene.known_sky.
 
     scene: Scene; exposures: an AlignedObservation of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
     spectra (n, C), in the views' units
+    smooth (n): CellImages of modes that come before those of `images`, or None; all None by default
     """
+    smooth = [None] * len(images) if smooth is None else smooth
     matrix = BlockMatrix(layout.sizes)
     for i, k in enumerate(layout.n_modes):
         matrix.block(i, i)[:k, :k] += np.eye(k)
@@ -93,7 +98,8 @@ def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
         at = layout.n_sky + np.arange(layout.n_shifts)
         matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2
     for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
-        _NormalAccumulator(matrix, layout, exposure, o, part).run(scene.origin, images, spectra)
+        sums = _NormalAccumulator(matrix, layout, exposure, o, part)
+        sums.run(scene.origin, images, smooth, spectra)
     return matrix
 
 
@@ -101,29 +107,58 @@ def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
 class _ComponentView:
     """Images of one component in an observation.
 
-    i: its index; k: number of its modes; low, high (2,): its window
+    i: its index; modes: slice of its node's unknowns, those of the modes here
+    low, high (2,): its window
     light (k or k + 2, C, ry, rx): of its modes, then of its slopes along y and x where a shift is
-        unknown, all times its spectrum; unit (C, ry, rx): of its morphology alone
+        unknown, all times its spectrum; unit (1 or 0, C, ry, rx): of its morphology alone, none
+        beside smooth modes
+    cell: of pixels in which its images are, see AlignedObservation
     """
 
     i: int
-    k: int
+    modes: slice
     low: np.ndarray
     high: np.ndarray
     light: np.ndarray
     unit: np.ndarray
+    cell: int = 1
+
+    @property
+    def k(self):
+        """Number of modes."""
+        return self.modes.stop - self.modes.start
 
     @cached_property
     def size(self):
         """Largest root of the squares' sum of its light."""
-        flat = self.light.reshape(len(self.light), self.unit.size)
+        flat = self.light.reshape(len(self.light), int(np.prod(self.light.shape[1:])))
         return np.sqrt(np.einsum("kp,kp->k", flat, flat).max(initial=0))
 
     def within(self, low, high, dtype=np.float32):
-        """light (k, C * P) of a type and unit (C, P) from `low` to `high`."""
+        """light (k, C * P) of a type and unit (1 or 0, C, P) from `low` to `high`."""
         cut = box_slices(low - self.low, high - low)
-        light, unit = self.light[:, :, *cut].astype(dtype, copy=False), self.unit[:, *cut]
-        return light.reshape(len(light), unit.size), unit.reshape(len(unit), -1)
+        light, unit = self.light[:, :, *cut].astype(dtype, copy=False), self.unit[:, :, *cut]
+        n_pixels = int(np.prod(high - low))
+        light = light.reshape(len(light), light.shape[1] * n_pixels)
+        return light, unit.reshape(*unit.shape[:2], n_pixels)
+
+    def in_cells(self, fine, wide):
+        """Images on another lattice with the same products with images that are smooth there.
+
+        fine, wide: the AlignedObservation in its own cells, and in those of the other
+        """
+        ratio = wide.cell // fine.cell
+        low, high = self.low // ratio, -(-self.high // ratio)
+        to_y, to_x = (
+            interpolation(np.arange(*own), ratio * np.arange(*cells) + (ratio - 1) / 2)
+            for own, cells in zip(zip(self.low, self.high), zip(low, high), strict=True)
+        )
+        to_y, to_x = to_y.T.astype(np.float32), to_x.astype(np.float32)
+        root = wide.sqrt_weights[:, *box_slices(low, high - low)]
+        scale = np.divide(1, root, out=np.zeros_like(root), where=root > 0)
+        own = fine.sqrt_weights[:, *box_slices(self.low, self.high - self.low)]
+        light, unit = (to_y @ (part * own) @ to_x * scale for part in (self.light, self.unit))
+        return replace(self, low=low, high=high, light=light, unit=unit, cell=wide.cell)
 
 
 class _NormalAccumulator:
@@ -132,6 +167,7 @@ class _NormalAccumulator:
     def __init__(self, matrix, layout, exposure, o, channels):
         self.matrix, self.layout, self.exposure = matrix, layout, exposure
         self.channels, self.shift = channels, layout.shift(o)
+        self.lattices = {1: exposure}
         at = layout.spectra_at(np.arange(channels.start, channels.stop))
         self.at = np.unique(at)
         # sums over channels of one band, where the observation has several
@@ -139,80 +175,119 @@ class _NormalAccumulator:
         if self.sum is None:
             self.at = at
 
-    def run(self, origin, images, spectra):
+    def run(self, origin, images, smooth, spectra):
         """Adds the observation's products of all pairs of components to the matrix."""
         pairs = zip(origin, images, strict=True)
         windows = [self.exposure.window(at, m.shape[1:]) for at, m in pairs]
         near: list[_ComponentView] = []
         for i in sorted(range(len(images)), key=lambda i: windows[i][0, 0]):
             low, high = windows[i]
-            near = [one for one in near if one.high[0] > low[0]]
+            near = [one for one in near if one.cell * one.high[0] > low[0]]
             if not (high > low).all():
                 continue
             spectrum = spectra[i, self.channels].astype(np.float32)
-            one = self._seen(i, images[i], spectrum, origin[i], low, high)
-            near.append(one)
-            both = [(other, one) if other.i <= i else (one, other) for other in near]
-            n_threads = self.exposure.threads_for(one.light)
-            products = map_threads(n_threads, lambda pair: _products(*pair), both)
-            for pair, found in zip(both, products, strict=True):
-                if found is not None:
-                    self._add(*pair, *found)
-            if self.layout.n_sky:
-                self._add_level(one)
+            own = [self._seen(i, images[i], spectrum, origin[i], low, high)]
+            if smooth[i] is not None:
+                own.append(self._seen_smooth(i, smooth[i], spectrum, origin[i], images[i].shape))
+            for one in own:
+                near.append(one)
+                both = [(other, one) if other.i <= i else (one, other) for other in near]
+                both = [self._on_one_lattice(*pair) for pair in both]
+                n_threads = self.exposure.threads_for(one.light)
+                products = map_threads(n_threads, lambda pair: _products(*pair), both)
+                for pair, found in zip(both, products, strict=True):
+                    if found is not None:
+                        self._add(*pair, *found)
+                if self.layout.n_sky:
+                    self._add_level(one)
         if self.layout.n_sky:
             at = np.arange(self.channels.start, self.channels.stop)
             common = self.matrix.block(self.layout.common, self.layout.common)
             common[at, at] += np.square(self.exposure.sqrt_weights, dtype=np.float64).sum((1, 2))
 
     def _seen(self, i, images, spectrum, origin, low, high):
-        k = len(images) - 1
+        n_modes = self.layout.n_modes[i]
+        modes = slice(n_modes - len(images) + 1, n_modes)
         if self.shift is not None:
             padded = np.pad(images[0], 1, mode="edge")
             images = np.concatenate([images, np.array(np.gradient(padded))[:, 1:-1, 1:-1]])
         seen = self.exposure.observe(images, i, origin, low, high)
-        unit, light = seen[0].copy(), seen[1:]
+        unit, light = seen[:1].copy(), seen[1:]
         light *= spectrum[:, None, None]
-        return _ComponentView(i, k, low, high, light, unit)
+        return _ComponentView(i, modes, low, high, light, unit)
+
+    def _seen_smooth(self, i, images, spectrum, origin, shape):
+        exposure = self._in_cells(self.exposure.cell_for(images.pixel))
+        low, high = exposure.window(origin, shape[1:])
+        light = exposure.observe(images.values, i, origin, low, high, images.pixel)
+        light *= spectrum[:, None, None]
+        modes = slice(0, len(images))
+        return _ComponentView(i, modes, low, high, light, light[:0], exposure.cell)
+
+    def _in_cells(self, cell):
+        """The observation in cells, made once."""
+        if cell not in self.lattices:
+            self.lattices[cell] = self.exposure.in_cells(cell)
+        return self.lattices[cell]
+
+    def _on_one_lattice(self, a, b):
+        """Two _ComponentViews on the wider one of their lattices."""
+        if a.cell == b.cell:
+            return a, b
+        wide = self._in_cells(max(a.cell, b.cell))
+        return tuple(
+            one if one.cell == wide.cell else one.in_cells(self._in_cells(one.cell), wide)
+            for one in (a, b)
+        )
 
     def _add(self, a, b, modes, by_a, by_b, units):
-        """Adds the products of two components, a.i <= b.i, to the matrix."""
+        """Adds the products of two components' images, a.i <= b.i, to the matrix."""
         same = a is b
         if self.sum is not None:
-            by_a, by_b, units = by_a @ self.sum, by_b @ self.sum, units @ self.sum
+            by_a, by_b, units = (part @ self.sum for part in (by_a, by_b, units))
         block = self.matrix.block(a.i, b.i)
-        block[: a.k, : b.k] += modes[: a.k, : b.k]
-        of_a, of_b = (s.k + self.at for s in (a, b))
-        block[: a.k, of_b] += by_b[: a.k]
-        block[of_a, : b.k] += by_a[: b.k].T
-        block[of_a, of_b] += units
+        of_a, of_b = (self.layout.n_modes[s.i] + self.at for s in (a, b))
+        block[a.modes, b.modes] += modes[: a.k, : b.k]
+        for unit in by_b:  # one or none, as below
+            block[a.modes, of_b] += unit[: a.k]
+        for unit in by_a:
+            block[of_a, b.modes] += unit[: b.k].T
+        for unit in units:
+            block[of_a, of_b] += unit
+        if a.i == b.i and not same:  # smooth modes of a component, with the rest of it
+            block[b.modes, a.modes] += modes[: a.k, : b.k].T
+            for unit in by_a:
+                block[b.modes, of_a] += unit[: b.k]
         if self.shift is None:
             return
-        common = self.layout.common
-        both = self.matrix.block(common, common)
-        square = modes[a.k :, b.k :] if same else modes[a.k :, b.k :] + modes[a.k :, b.k :].T
-        both[np.ix_(self.shift, self.shift)] += square
-        sides = [(a.i, modes[: a.k, b.k :], of_a, by_a[b.k :].T)]
+        common, slopes = self.layout.common, modes[a.k :, b.k :]
+        if slopes.size:
+            both = self.matrix.block(common, common)
+            both[np.ix_(self.shift, self.shift)] += slopes if same else slopes + slopes.T
+        sides = [(a, modes[: a.k, b.k :], of_a, by_a[:, b.k :])]
         if not same:
-            sides.append((b.i, modes[a.k :, : b.k].T, of_b, by_b[a.k :].T))
-        for i, rows, at, ones in sides:
-            side = self.matrix.block(i, common)
-            side[: len(rows), self.shift] += rows
-            side[np.ix_(at, self.shift)] += ones
+            sides.append((b, modes[a.k :, : b.k].T, of_b, by_b[:, a.k :]))
+        for one, rows, at, units in sides:
+            if rows.shape[1]:
+                side = self.matrix.block(one.i, common)
+                side[one.modes, self.shift] += rows
+                for unit in units:
+                    side[np.ix_(at, self.shift)] += unit.T
 
     def _add_level(self, one):
         """The products of a component with a level of 1 in each channel."""
-        level = self.exposure.sqrt_weights[:, *box_slices(one.low, one.high - one.low)]
+        root = self._in_cells(one.cell).sqrt_weights
+        level = root[:, *box_slices(one.low, one.high - one.low)]
         level = level.reshape(len(level), -1)
         light, unit = one.within(one.low, one.high)
         products = _by_channel(light, level)
         at = np.arange(self.channels.start, self.channels.stop)
         side = self.matrix.block(one.i, self.layout.common)
-        side[: one.k, at] += products[: one.k]
-        side[one.k + self.layout.spectra_at(at), at] += np.einsum(
-            "cp,cp->c", unit, level, dtype=np.float64
-        )
-        if self.shift is not None:
+        side[one.modes, at] += products[: one.k]
+        for image in unit:
+            spectra = self.layout.n_modes[one.i] + self.layout.spectra_at(at)
+            side[spectra, at] += np.einsum("cp,cp->c", image, level, dtype=np.float64)
+        if self.shift is not None and len(products) > one.k:
             both, found = self.matrix.block(*[self.layout.common] * 2), products[one.k :]
             both[np.ix_(self.shift, at)] += found
             both[np.ix_(at, self.shift)] += found.T
@@ -222,7 +297,7 @@ def _products(a, b):
     """Products of two _ComponentViews where their windows overlap; None without overlap.
 
     They are products of the light of both (ka, kb), of b's light with a's unit and of a's light
-    with b's (k, C), and of the units (C,).
+    with b's (u, k, C), and of the units (u, C), u = 1 or, without a unit, 0.
     """
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     if not (high > low).all():
@@ -231,10 +306,17 @@ def _products(a, b):
     light_a, unit_a = a.within(low, high, dtype)
     same = a is b  # NumPy computes half the products if both factors are the same array
     light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
-    by_b = _by_channel(light_a, unit_b)
-    by_a = by_b if same else _by_channel(light_b, unit_a)
-    units = np.einsum("cp,cp->c", unit_a, unit_b, dtype=np.float64)
-    return light_a @ light_b.T, by_a, by_b, units
+    by_b = _by_units(light_a, unit_b)
+    by_a = by_b if same else _by_units(light_b, unit_a)
+    both = zip(unit_a, unit_b, strict=False)
+    units = [np.einsum("cp,cp->c", *pair, dtype=np.float64) for pair in both]
+    return light_a @ light_b.T, by_a, by_b, np.reshape(units, (len(units), unit_a.shape[1]))
+
+
+def _by_units(light, units):
+    """Products (u, k, C) of light (k, C * P) with each channel of units (u, C, P)."""
+    found = [_by_channel(light, unit) for unit in units]
+    return np.reshape(found, (len(units), len(light), units.shape[1]))
 
 
 def _by_channel(light, unit):

@@ -14,6 +14,7 @@ from .aligned_observation import align_observations
 from .block_matrix import BlockCholesky
 from .bound_bias import negative_chi2_gradient
 from .errors import Errors, MorphologyErrors, PosteriorSampler
+from .mode_images import ModeImages, sums_with
 from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
@@ -39,7 +40,7 @@ class Posterior:
     fit_sky, fit_shifts: True if sky levels, and shifts of all observations but the first, are
         unknowns
 
-    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
+    modes (n): (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
         BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the
         same nodes
     released: arrays, for each node the changes of its unknowns without the bound of bound_bias.py
@@ -50,8 +51,9 @@ class Posterior:
     def __init__(self, solution, exposures, *, fit_sky=False, fit_shifts=False):
         n, n_channels = solution.spectra.shape
         self.solution = solution
-        images, self.beyond, held = zip(*(solution.modes(i) for i in range(n)), strict=True)
-        self.modes = [m[1:] for m in images]
+        found = zip(*(solution.modes(i) for i in range(n)), strict=True)
+        images, self.modes, self.beyond, held = found
+        smooth = [m.smooth if isinstance(m, ModeImages) else None for m in self.modes]
         self.layout = UnknownLayout(
             np.array([len(m) for m in self.modes]),
             n_channels,
@@ -60,7 +62,7 @@ class Posterior:
             solution.scene.ties,
         )
         self.matrix = normal_matrix(
-            solution.scene, exposures, images, solution.spectra, self.layout
+            solution.scene, exposures, images, solution.spectra, self.layout, smooth
         )
         self.factor = BlockCholesky(self.matrix)
         self.covariance = self.factor.inverse()
@@ -135,7 +137,8 @@ class Posterior:
             far = self.beyond[i]
             total = morph.sum() + far.sums[0]
             flux[owner[i]] += s.spectra[i] * total
-            by_mode = np.outer(s.spectra[i], modes.sum((1, 2)) + far.slopes[0])
+            sums = sums_with(modes, np.ones((1, *morph.shape), modes.dtype))[0]
+            by_mode = np.outer(s.spectra[i], sums + far.slopes[0])
             slopes.append(np.concatenate([by_mode, total * of_channels], axis=1))
         return flux, slopes
 
@@ -159,8 +162,8 @@ class Posterior:
             )
             rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
-                flat, images = slope.reshape(5, -1), self.modes[i]
-                by_mode = flat.astype(np.float32) @ images.reshape(len(images), flat.shape[1]).T
+                flat = slope.reshape(5, -1)
+                by_mode = sums_with(self.modes[i], slope)
                 by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
                 by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
                 rows.append(np.concatenate([by_mode, by_light[:, None] * by_band], axis=1))

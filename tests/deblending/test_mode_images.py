@@ -1,0 +1,99 @@
+"""Smooth modes on wide pixels: what is computed from them, and errors of fits with them."""
+
+import numpy as np
+import pytest
+from helpers import scenes
+
+from clresample import Settings
+from clresample.deblending.posterior import smooth_modes
+from clresample.deblending.posterior.errors import PosteriorSampler
+from clresample.deblending.posterior.mode_images import (
+    CellImages,
+    ModeImages,
+    cell_sums,
+    combined,
+    subtract,
+    sums_with,
+)
+from clresample.deblending.posterior.posterior import Posterior
+from clresample.files.draws import draw_hdus, read_draws
+
+LARGE = (((32.4, 30.7), (2000, 1500, 2500), 9.0), ((40.0, 52.0), (90, 60, 90), 2.0))
+
+
+def drawn(shape=(7, 10), pixel=4, k=(3, 2)):
+    rng = np.random.default_rng(0)
+    cells = k[0], *(-(-n // pixel) for n in shape)
+    return ModeImages(CellImages(rng.normal(size=cells), pixel), rng.normal(size=(k[1], *shape)))
+
+
+def test_images_in_cells_are_arrays():
+    """They keep the means, and polynomials of second order."""
+    modes, rng = drawn(), np.random.default_rng(1)
+    dense = np.asarray(modes)
+    assert dense.shape == modes.shape == (5, 7, 10) and len(modes) == 5
+    values = rng.normal(size=(4, 5))
+    np.testing.assert_allclose(combined(modes, values), np.tensordot(values, dense, 1))
+    np.testing.assert_allclose(combined(modes, values[0]), np.tensordot(values[0], dense, 1))
+    weights = rng.normal(size=(2, 7, 10))
+    wanted = np.tensordot(weights, dense, ((1, 2), (1, 2)))
+    np.testing.assert_allclose(sums_with(modes, weights), wanted)
+    y, x = np.indices((20, 24)) / 10
+    image = y**2 - 2 * x**2 + x * y
+    cells = CellImages(cell_sums(image, 4)[None] / 16, 4)
+    found = cells.on_pixels(cells.values, image.shape)[0]
+    np.testing.assert_allclose(cell_sums(found, 4), cell_sums(image, 4))
+    np.testing.assert_allclose(found, image, atol=1e-9)
+    image, parts = rng.normal(size=(7, 10)), rng.normal(size=5)
+    before = sums_with(modes, np.ones((1, 7, 10)))[0]
+    subtract(modes, parts, image)
+    after = sums_with(modes, np.ones((1, 7, 10)))[0]
+    padded = cell_sums(image, 4).sum(), image.sum()
+    assert padded[0] == pytest.approx(padded[1])
+    np.testing.assert_allclose(before[3:] - after[3:], parts[3:] * image.sum())
+
+
+@pytest.fixture(scope="module")
+def given(device):
+    """What the Posterior of a large galaxy with a small one on its flank is made of."""
+    kept, make = [], Posterior.__init__
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Posterior, "__init__", lambda *a, **k: kept.append(a[1:]) or make(*a, **k))
+        free = Settings(fit_sky=True, fit_shifts=True, max_iter=15)
+        scenes.fit(scenes.blend(LARGE, shape=(64, 72)), device, settings=free)
+    return kept[0]
+
+
+def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
+    """Of fluxes and moments, with sky and shifts; of what the bound did; of draws."""
+    monkeypatch.setattr(smooth_modes, "MAX_MODES", 40)
+    found, draws = [], []
+    for wide in (True, False):
+        with monkeypatch.context() as patch:
+            if not wide:
+                patch.setattr(smooth_modes, "PIXELS_A_SIGMA", 1000)
+            one = Posterior(*given, fit_sky=True, fit_shifts=True)
+        sharp = [not isinstance(m, ModeImages) for m in one.modes]
+        assert sharp == [not wide, True]
+        found.append(one.errors(np.arange(2), np.zeros((2, 3)), np.ones(3), 0.0))
+        sampler = PosteriorSampler(one.modes, one.factor, np.ones(3), np.ones(2))
+        draws.append(sampler.changes(0)[0].std(0))
+    wide, fine = found
+    for a, b in ((wide.colour, fine.colour), (wide.moments, fine.moments)):
+        a, b = (np.sqrt(np.diagonal(c, axis1=1, axis2=2)) for c in (a, b))
+        np.testing.assert_allclose(a, b, rtol=0.02)
+    error = np.sqrt(np.diagonal(fine.colour, axis1=1, axis2=2))
+    np.testing.assert_allclose((wide.flux_bound_bias - fine.flux_bound_bias) / error, 0, atol=0.02)
+    np.testing.assert_allclose(wide.flux[:, 0, 1], fine.flux[:, 0, 1], rtol=0.05)
+    assert np.abs(draws[0] - draws[1]).max() < 0.2 * draws[1].max()
+
+
+def test_draws_on_wide_pixels_are_stored_bit_by_bit(given, monkeypatch):
+    monkeypatch.setattr(smooth_modes, "MAX_MODES", 40)
+    one = Posterior(*given)
+    sampler = PosteriorSampler(one.modes, one.factor, np.ones(3), np.ones(2))
+    hdus = {hdu.name: hdu for hdu in draw_hdus(sampler)}
+    back = read_draws(hdus, [m.shape[1:] for m in one.modes])
+    for i in range(2):
+        for a, b in zip(sampler.changes(i), back.changes(i), strict=True):
+            np.testing.assert_array_equal(a, b)
