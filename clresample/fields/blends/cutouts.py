@@ -8,7 +8,7 @@ from ...deblending.blend import Blend
 from ...deblending.spectra import MODEL_ERROR
 from ...sky.box import Box, box_within
 from ...sky.frame import model_frame
-from ...sky.sources import ExtendedSource
+from ...sky.sources import ExtendedSource, PointSource
 
 # [px] Sides of the cutouts of fits are multiples of this number, like the boxes of their models:
 # with smaller steps there are more batches, with larger ones more sky to compute.
@@ -49,16 +49,18 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
         if seen is not None:
             observations.append(seen)
             boxes[mosaic.name] = box
-    sources = tuple(
-        ExtendedSource(
-            position_px=tuple(map(float, plan.positions[s] - patch.box[:2])),
-            name=str(plan.ids[s]),
-            n_components=known.get(int(plan.ids[s])),
-        )
-        for s in patch.sources
-    )
+    sources = tuple(_source(patch, plan, s, known) for s in patch.sources)
     frame = model_frame(observations, grid=grid) if observations else None
     return Blend(tuple(observations), sources, frame), boxes
+
+
+def _source(patch, plan, s, components):
+    """The source s of a plan in the patch's pixels, a free PointSource if it is a star."""
+    number = int(plan.ids[s])
+    place = tuple(map(float, plan.positions[s] - patch.box[:2]))
+    if number in plan.stars:
+        return PointSource(position_px=place, name=str(number), free_position=True)
+    return ExtendedSource(position_px=place, name=str(number), n_components=components.get(number))
 
 
 def fit_box(mosaic, grid) -> Box:

@@ -56,6 +56,7 @@ class FitPlan:
     failed_tiles: {tile's number: why it could not be searched}
     hosts (S,): int64, id of the source whose clump each may be, its own where there is none; None =
         their own
+    stars: ids of stars with a saturated or masked core, which are fitted as points
     """
 
     positions: np.ndarray
@@ -66,6 +67,7 @@ class FitPlan:
     cut_groups: tuple[tuple[int, ...], ...] = ()
     failed_tiles: dict = field(default_factory=dict)
     hosts: np.ndarray | None = None
+    stars: tuple[int, ...] = ()
 
     @cached_property
     def peak_of(self) -> dict[int, float]:
@@ -90,6 +92,7 @@ class FitPlan:
                 "cut_groups": self.cut_groups,
                 "failed_tiles": self.failed_tiles,
                 "hosts": None if self.hosts is None else self.hosts.tolist(),
+                "stars": self.stars,
             }
         )
 
@@ -123,6 +126,7 @@ class FitPlan:
             tuple(map(tuple, about["cut_groups"])),
             about["failed_tiles"],
             about.get("hosts") and np.array(about["hosts"], np.int64),
+            tuple(about.get("stars", ())),
         )
 
 
@@ -159,6 +163,7 @@ def make_fit_plan(
     n_channels=1,
     most=32,
     hosts=None,
+    stars=None,
 ) -> FitPlan:
     """Blends from sources and the labels of their light, oversized ones cut, in groups by cost.
 
@@ -171,6 +176,7 @@ def make_fit_plan(
         worker dies
     hosts (S, 2) [px]: see TileDetections; cut blends keep them with their clumps if the limits
         permit it
+    stars (S,): bool, see TileDetections; None = no source is one
     """
     limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
@@ -205,7 +211,10 @@ def make_fit_plan(
     patches = _patches(made)
     groups = _groups(patches, memory, n_channels, most)
     giants = _groups([p for p in patches if p.pieces > 1], memory, n_channels, most)
-    return FitPlan(positions, ids, np.asarray(peaks), patches, groups, giants, hosts=hosts)
+    points = () if stars is None else tuple(ids[stars].tolist())
+    return FitPlan(
+        positions, ids, np.asarray(peaks), patches, groups, giants, hosts=hosts, stars=points
+    )
 
 
 def host_ids(positions, peaks, ids, hosts) -> np.ndarray:

@@ -12,6 +12,7 @@ from ...measurement.detection import detect, noise_scatter
 from ...measurement.signal_to_noise import WIDTHS_ARCSEC
 from ...sky.box import Box
 from ...sky.frame import model_frame
+from ...sky.sources import PointSource
 
 # [sigma] Level of footprints in the combined signal-to-noise image. At 2, light outside a source's
 # footprint is below the noise everywhere. With a lower level noise links separate sources; with a
@@ -33,6 +34,7 @@ class TileDetections:
     lit (Ny, Nx) bool: the core's pixels of footprints, grown by the PSF
     hosts (S, 2) [px]: position of the source whose clump each may be, its own where there is none;
         None = their own
+    stars (S,): bool, stars with a saturated or masked core; None = no source is one
     """
 
     positions: np.ndarray
@@ -40,6 +42,7 @@ class TileDetections:
     snr_map: np.ndarray
     footprint_mask: np.ndarray
     hosts: np.ndarray | None = None
+    stars: np.ndarray | None = None
 
 
 def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDetections:
@@ -64,16 +67,19 @@ def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDe
     lit = grown_footprints(found.image > FOOTPRINT_SIGMA, positions, radius)
     positions = positions + tile.outer[:2]
     hosts = positions[found.groups]
+    stars = np.array([isinstance(s, PointSource) for s in found.sources], bool)
     own = tile.core.contains(positions)
     inner = tile.core.relative_to(tile.outer).slices
     light = np.clip(found.image[inner], -100, 6e4).astype(np.float16)
-    return TileDetections(positions[own], found.peaks[own], light, lit[inner], hosts[own])
+    own_peaks = found.peaks[own]
+    return TileDetections(positions[own], own_peaks, light, lit[inner], hosts[own], stars[own])
 
 
 def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -> TileDetections:
     """TileDetections of a catalogue's sources at positions (S, 2) [px of the field].
 
-    Their footprints are those of `search_tile`; peaks are the combined signal to noise there.
+    Their footprints are those of `search_tile`; peaks are the combined signal to noise there. The
+    nearest one to a star with a saturated core, within the radius of footprints, is that star.
     """
     whole = tile._replace(core=tile.outer)
     outer = search_tile(mosaics, reference, whole, threshold=1e30, scatters=scatters)
@@ -83,14 +89,17 @@ def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -
     at = nearest(positions[near]) - np.array(tile.outer[:2])
     observations = observations_on(mosaics, reference, tile.outer)
     inner = tile.core.relative_to(tile.outer).slices
-    lit = np.zeros(light.shape, bool)
+    lit, stars = np.zeros(light.shape, bool), np.zeros(len(positions), bool)
     if observations:
         frame = model_frame(observations, grid=_cut(reference, tile.outer))
         radius = footprint_radius(observations, frame)
+        for star in outer.positions if near.any() else ():
+            away = np.where(near, np.hypot(*(positions - star).T), np.inf)
+            stars[away.argmin()] |= away.min() <= radius
         lit = grown_footprints(light > FOOTPRINT_SIGMA, at, radius)
     at = nearest(positions[own]) - np.array(tile.outer[:2])
     peaks = light[at[:, 0], at[:, 1]]
-    return TileDetections(positions[own], peaks, outer.snr_map[inner], lit[inner])
+    return TileDetections(positions[own], peaks, outer.snr_map[inner], lit[inner], stars=stars[own])
 
 
 def snr_scatter(mosaics, reference) -> dict:

@@ -64,6 +64,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
     positions = np.concatenate([f.positions for f in everything])
     peaks = np.concatenate([f.peaks for f in everything])
     hosts = np.concatenate([f.positions if f.hosts is None else f.hosts for f in everything])
+    stars = np.concatenate([_stars_of(f) for f in everything])
     del everything
     # The division into tiles changes the last digits and the order of detections. Both affect the
     # rounding of fits, which would change fluxes of some blends by two tenths of their errors.
@@ -71,7 +72,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
         positions = np.floor(positions * STEPS) / STEPS  # not up: over the edge of the core
         hosts = np.floor(hosts * STEPS) / STEPS
     order = np.lexsort(positions.T[::-1])
-    positions, peaks, hosts = positions[order], peaks[order], hosts[order]
+    positions, peaks, hosts, stars = (a[order] for a in (positions, peaks, hosts, stars))
     footprints = link_footprints(tiles, found, region, work)
     plan = make_fit_plan(
         positions,
@@ -83,6 +84,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
         memory=options.group_memory,
         n_channels=n_channels,
         hosts=hosts,
+        stars=stars,
     )
     plan = replace(plan.restricted_to(core), failed_tiles=lost)
     if hasattr(footprints.labels, "flush"):
@@ -141,6 +143,11 @@ def _lost(tile, positions):
     return TileDetections(positions[own], np.zeros(own.sum()), light, lit)
 
 
+def _stars_of(found):
+    """`TileDetections.stars`, (S,) bool."""
+    return np.zeros(len(found.positions), bool) if found.stars is None else found.stars
+
+
 def _found_path(work, number):
     return work / f"tile-{number:05d}.npz"
 
@@ -163,6 +170,7 @@ def _search_tile(shared, tile, given):
         peaks=found.peaks,
         light=found.snr_map,
         hosts=found.positions if found.hosts is None else found.hosts,
+        stars=_stars_of(found),
         lit=np.packbits(found.footprint_mask),
     )
     return len(found.positions), file.getvalue()
@@ -179,4 +187,5 @@ def _read_found(work, number):
     with np.load(_found_path(work, number)) as file:
         light = file["light"]
         lit = np.unpackbits(file["lit"], count=light.size).reshape(light.shape).astype(bool)
-        return TileDetections(file["positions"], file["peaks"], light, lit, file["hosts"])
+        hosts, stars = file["hosts"], file["stars"]
+        return TileDetections(file["positions"], file["peaks"], light, lit, hosts, stars)
