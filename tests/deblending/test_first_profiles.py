@@ -6,6 +6,7 @@ from helpers.scenes import blend
 
 from clresample import Settings
 from clresample.deblending.fit import Fit, start_fits
+from clresample.deblending.start import first_profiles as first_profiles_module
 from clresample.deblending.start import profile_fit
 from clresample.deblending.start.first_profiles import GROWTH, first_profiles
 
@@ -14,6 +15,9 @@ SMALL = [
     ((48 + 22 * np.sin(a), 48 + 22 * np.cos(a)), (200, 260, 150), 1.5)
     for a in (0.3, 1.6, 2.8, 4.1, 5.4)
 ]
+
+
+STAR = ((20.0, 24.0), (900, 800, 700), 0)
 
 
 @pytest.fixture
@@ -65,12 +69,51 @@ def test_small_galaxies_are_started_once(sized):
     assert (found < np.log(1.5 * GROWTH)).all()
 
 
+def spoilt(fit, scenes, _error):
+    """Sets sizes from which least squares do not return in place of those of the grid."""
+    fit.theta[scenes, :, 0] = np.log(1e6 * GIANT[2])
+
+
 def test_of_two_starts_the_better_fit_stays(sized):
     """A grid that gives every galaxy the size of the giant changes nothing."""
-
-    def spoilt(fit, scenes, error):
-        fit.theta[scenes, :, 0] = np.log(100 * GIANT[2])
-
     *_, found = sized([*SMALL[:2], GIANT], spoilt)
     assert found[2] == pytest.approx(np.log(GIANT[2]), abs=0.1)
     assert (found[:2] < np.log(1.5 * GROWTH)).all()
+
+
+def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
+    """The first start comes back with its doubt: chi2 is then that of the state solved anew."""
+    measured = []
+
+    def noted(fit, scenes):
+        kept = fit.chi2[scenes].copy()
+        fit._take(scenes)
+        measured.append((kept, fit.chi2[scenes]))
+
+    monkeypatch.setattr(profile_fit.ProfileFit, "_run_without_doubt", noted)
+    sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0)], spoilt)
+    ((kept, again),) = measured
+    assert len(kept)
+    np.testing.assert_allclose(kept, again, rtol=1e-5)
+
+
+def test_profiles_do_not_depend_on_the_other_scenes(device, monkeypatch):
+    """With a fitted sky: a giant alone, and beside a scene with a star, which is modelled first."""
+    gains, products = [], first_profiles_module._products
+
+    def noted(*args):
+        around, right, *rest = products(*args)
+        gains.append(right[around.scene == around.n_scenes - 1])
+        return around, right, *rest
+
+    monkeypatch.setattr(first_profiles_module, "_products", noted)
+
+    def fit_of(objects):
+        one = blend(objects, shape=(96, 96), seed=5)
+        return Fit(one, Settings(fit_sky=True), device, np.float32, pad=1)
+
+    start_fits([fit_of([GIANT])])
+    alone = gains.pop(0)
+    gains.clear()
+    start_fits([fit_of([STAR, GIANT]), fit_of([GIANT])])
+    np.testing.assert_allclose(gains[0], alone, rtol=1e-4)

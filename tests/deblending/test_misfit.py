@@ -11,6 +11,7 @@ from clresample import Flag, Grid, PointSource, catalogue, deblend, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.status import with_misfit_status
 from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, fine_scatter
+from clresample.sky.observation import masked
 
 GRID = Grid.flat((80, 84), 0.1)
 PLACES = (30, 28), (48, 55)
@@ -71,6 +72,17 @@ def test_a_bright_galaxy_that_is_half_a_percent_off_is_not_wrong():
     assert table["misfit_sigma"][0] > 20
     assert table["misfit_fraction"][0] == pytest.approx(0.005, rel=0.3)
     assert not any(flagged(found)) and found.status == "converged" and summary(found)["good"]
+
+
+def test_light_that_is_left_is_compared_with_the_light_beside_a_masked_core():
+    """A model that is right but for a tenth of the light beside a core that holds most of it."""
+    bright = broken(times=(1.1, 1), bright=3000.0)
+    (seen,) = bright.observations
+    core, (y, x) = np.zeros(seen.data.shape, bool), PLACES[0]
+    core[:, y - 5 : y + 6, x - 5 : x + 6] = True
+    without = replace(bright, observations=(masked(seen, core),))
+    assert catalogue(without)["misfit_fraction"][0] == pytest.approx(0.1, rel=0.3)
+    assert flagged(without) == [True, False]
 
 
 def test_a_misfit_of_a_tenth_of_the_flux_is_flagged_where_it_is_no_noise():

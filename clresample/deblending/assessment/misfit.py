@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
+from ..component_images import image_within, window_of
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 from .extended import extended_light
 
@@ -44,7 +45,8 @@ class Misfit:
     chi2 (S, C) [1]: per pixel there, over that of the noise; NaN without pixels
     light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, minus the
         contribution of noise; if a residual is over 5 sigma, at least the flux of that point source
-    flux (S, C) [counts]: of the model, and at least its error at fixed morphology
+    flux (S, C) [counts]: of the model on pixels with a weight, since that of a saturated star's
+        core says nothing of its fit; at least the flux error at fixed morphology
     whole_excess, whole_chi2, whole_light (2, C): the same for the pixels of all sources together,
         and of all pixels of the channel on the frame
     wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
@@ -115,7 +117,7 @@ def misfit_of(result) -> Misfit:
         worst.append(left.worst(n_sources))
         rest += [_of_channel(left, c, n_sources) for c in range(len(left.filtered))]
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
-    fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own), _model_flux(result)]
+    fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own), _observed_flux(result, remainders)]
     fields += [*(rows[-2:] for rows in own), *extended_light(result, remainders)]
     return Misfit(*fields)
 
@@ -187,11 +189,15 @@ def _apart(lag):
     return (rows[0], columns[0]), (rows[1], columns[1])
 
 
-def _model_flux(result):
+def _observed_flux(result, remainders):
     """The `flux` of Misfit."""
     found, error = np.zeros((2, len(result.sources), len(result.channels)))
+    channels = result.channel_slices()
+    for rendered, left, part in zip(result.rendered, remainders, channels, strict=True):
+        for i, c in enumerate(result.components):
+            window = window_of(rendered, i)
+            image = image_within(rendered, i, window) * left.used[:, *window]
+            found[c.source, part] += c.spectrum[part] * image.sum((1, 2))
     for i, c in enumerate(result.components):
-        total = c.morphology.sum()
-        found[c.source] += c.spectrum * total
-        error[c.source] += np.sqrt(np.maximum(result.covariance[:, i, i], 0)) * total
+        error[c.source] += np.sqrt(np.maximum(result.covariance[:, i, i], 0)) * c.morphology.sum()
     return np.maximum(np.maximum(found, error), 1e-300)

@@ -104,19 +104,7 @@ def _next(looking, models, rest, error):
     """
     listed = [(i, theta) for i, own in rest.items() for theta in own]
     component = np.array([i for i, _ in listed])
-    if models:
-        before = _instead(looking, list(models.items()))
-        before.solve(error)
-        before.compute_residuals(error)
-    around = _instead(looking, listed)
-    right = np.zeros((len(listed), looking.n_channels))
-    for sight in around.sights:
-        right[around.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0] if models else 0
-    if looking.ties is not None:
-        right = looking.ties.spread(looking.ties.total(right))
-    sky = before.sky if models else looking.sky
-    light, alone = around.light_products(sky, error)
-    right = right if models else light
+    around, right, light, alone = _products(looking, models, listed, error)
     noise = alone + (NEIGHBOUR_MODEL_ERROR * (light - right)) ** 2
     square = np.maximum(right, 0) ** 2
     gain = np.divide(square, noise, out=np.zeros_like(noise), where=alone > 0).sum(axis=1)
@@ -126,6 +114,29 @@ def _next(looking, models, rest, error):
     going = np.unique(around.scene[best][gain[best] > gain[first] + NEED])
     at = best[np.isin(around.scene[best], going)]
     return dict(_apart(around, listed, gain, at))
+
+
+def _products(looking, models, listed, error):
+    """LinearisedScenes of components [(i, theta)], and three products (n, C) of their images.
+
+    With the data minus the models {component: theta}, with the data, and with themselves.
+    """
+    sky, modelled = looking.sky.copy(), np.zeros(0, int)
+    if models:
+        before = _instead(looking, list(models.items()))
+        before.solve(error)
+        before.compute_residuals(error)
+        modelled = before.scenes
+        sky[modelled] = before.sky[modelled]
+    around = _instead(looking, listed)
+    right = np.zeros((len(listed), looking.n_channels))
+    for sight in around.sights:
+        right[around.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0]
+    if looking.ties is not None:
+        right = looking.ties.spread(looking.ties.total(right))
+    light, alone = around.light_products(sky, error)
+    right = np.where(np.isin(around.scene, modelled)[:, None], right, light)
+    return around, right, light, alone
 
 
 def _apart(around, listed, gain, at):

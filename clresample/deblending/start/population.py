@@ -72,13 +72,14 @@ class PopulationPrior:
 
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text
+    own_light (B, 1): OWN_LIGHT in scenes started from large galaxies, 0 in others
     galaxies (B, n): bool, of which there are galaxies
     """
 
     def __init__(self, shapes, scene, index, n_scenes, n_most, n_parameters):
         size = n_scenes, n_most, n_parameters
         self.mean, self.scatter = np.zeros(size), np.ones(size)
-        self.contamination = np.ones(size[:2])
+        self.contamination, self.own_light = np.ones(size[:2]), np.zeros((n_scenes, 1))
         self.galaxies, self._known = np.zeros((2, *size[:2]), bool)
         for b, i, shape in zip(scene, index, shapes, strict=True):
             n = len(shape.mean)
@@ -95,7 +96,7 @@ class PopulationPrior:
 
     def reset(self, scenes, other):
         """Takes over the prior of some scenes of another one, for the same components."""
-        for name in ("mean", "scatter", "contamination", "_common", "_own"):
+        for name in ("mean", "scatter", "contamination", "own_light", "_common", "_own"):
             getattr(self, name)[scenes] = getattr(other, name)[scenes]
 
     def set_contamination(self, scenes, found):

@@ -38,7 +38,6 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
-    own_light (B, 1): OWN_LIGHT in scenes with large galaxies, 0 in others
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -52,7 +51,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness, self.own_light = np.zeros(len(shapes)), np.zeros((size[0], 1))
+        self.brightness = np.zeros(len(shapes))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -84,9 +83,9 @@ class ProfileFit:
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
         before, chi2 = self._copy(), self._chi2_as_expected(scenes)
-        self.own_light[scenes] = OWN_LIGHT
         self.theta[scenes] = self.expected.mean[scenes]
         self.population.reset(scenes, self.expected)
+        self.population.own_light[scenes] = OWN_LIGHT
         self._look(scenes, self.theta, slopes=False)
         self.looking.solve(MODEL_ERROR)
         first_profiles(self, scenes, MODEL_ERROR)
@@ -228,7 +227,7 @@ class ProfileFit:
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        given = normal, spectra, self.source[scenes], self.own_light[scenes]
+        given = normal, spectra, self.source[scenes], self.population.own_light[scenes]
         self.population.set_contamination(scenes, contamination_factors(*given))
 
     def _take_equations(self, scenes):
