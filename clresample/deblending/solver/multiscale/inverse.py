@@ -9,8 +9,9 @@ more for a bright galaxy, with these blocks ten to thirty. For a source of profi
 T_c (evidence.py) is used for the whole box. A source of many coefficients has a block for each part
 of its box, to which blocks of its coarser scales, which extend further, are added. The inverse is
 then wrong by a factor of a hundred for its widest waves, and without these by thousands. Other
-sources, edges and the spectra are not in the blocks; L-BFGS accounts for them. The blocks are
-computed in NumPy on the host, at the start and after updates of strengths.
+sources, edges and the spectra are not in the blocks; L-BFGS accounts for them. Such a source also
+has a ScaleDirection, see scale_direction.py. All are computed in NumPy on the host, at the start
+and after updates of strengths.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from scipy.linalg import lapack
 
 from .evidence import N_FREQUENCIES
 from .prior import kernel_rows
+from .scale_direction import ScaleDirection, scale_coefficients
 
 # Smallest ratio of the data's curvature to the prior's for coefficients in blocks. With 3 the
 # blocks take a tenth more of a fit's time, without fewer iterations; with 100, fits need half as
@@ -81,7 +83,8 @@ class BlockPreconditioner:
     def blocks(self, strengths, spectrum):
         """The CurvatureBlocks near strengths (J,) and a spectrum (C,).
 
-        Blocks of one level have no coefficient in common; the results of levels are added.
+        Blocks of one level have no coefficient in common; the results of levels are added. The last
+        element is the ScaleDirection of a source of several blocks at level 0.
         """
         if self._at is None or self._moved(strengths, spectrum):
             self._at = strengths.copy(), spectrum.copy()
@@ -109,8 +112,18 @@ class BlockPreconditioner:
                 root = _root(curvature, strengths[own[:, 0]] ** -2)
                 yield CurvatureBlock(level, self._places(own), root)
             if len(parts) < 2:
-                return
+                break
             rows = rows[rows[:, 0] > rows[:, 0].min()]
+        if level:
+            yield self._scale_direction(strengths, spectrum)
+
+    def _scale_direction(self, strengths, spectrum):
+        """The ScaleDirection (all coefficients,), of curvature 1 in the prior and data together."""
+        z, change = scale_coefficients(self._evidence.prior, self._profile, strengths)
+        seen = _through(self._evidence.sharpness(spectrum), change[None], 1)
+        curvature = sum((part**2).sum() / a**2 for part, a in zip(z, strengths, strict=True))
+        curvature += max(seen[0] @ change.ravel(), 0)
+        return ScaleDirection(np.concatenate([part.ravel() for part in z]) / np.sqrt(curvature))
 
     def _places(self, rows):
         """Indices of coefficients (m, 3) of scale, y, x among all of the source's."""

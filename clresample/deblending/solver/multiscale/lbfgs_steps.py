@@ -7,6 +7,7 @@ import numpy as np
 from ..boxes import ALIGN
 from .factor_store import FactorStore
 from .inverse import MAX_BLOCK_SIZE, PANEL
+from .scale_direction import ScaleDirection
 
 # What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
@@ -29,7 +30,7 @@ class LbfgsSteps:
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._levels, self.shelf = [], shelf or FactorStore(b.device, b.dtype)
+        self._levels, self._directions, self.shelf = [], [], shelf or FactorStore(b.device, b.dtype)
         self._sent = []  # events of uploads that may be on their way
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
@@ -51,9 +52,13 @@ class LbfgsSteps:
             hg_new=hg_new,
         )
         size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
-        self._invert = b.launcher(
-            "block_inverse.cl", "apply_block_inverse", 2, local_size=size, **macros
-        ).bind(plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new)
+        given = {"plan": self._plan, "size": v.size, "ring_hy": v.hy, "y": y}
+        self._invert, self._add_directions = (
+            b.launcher("block_inverse.cl", name, 2, local_size=size, **macros).bind(
+                **given, projected=projected, hg_new=hg_new
+            )
+            for name in ("apply_block_inverse", "add_directions")
+        )
         self._change = launcher("inner_products").bind(
             **shared, g=v.g, y=y, projected=projected, precision=v.precision, out=self._sums
         )
@@ -76,7 +81,7 @@ class LbfgsSteps:
             precision=v.precision,
             h=v.h,
         )
-        self._size = group, self._n_chunks
+        self._size, self._vector_size = (group, self._n_chunks), v.size
         self._reweigh_size = group, planes.shape[1], b.n_free
 
     def follow(self, pairs, mode):
@@ -98,6 +103,8 @@ class LbfgsSteps:
         self._trial(self._size)
         for size, given in self._levels:
             self._invert(size, **given)
+        for size, given in self._directions:
+            self._add_directions(size, **given)
         self._change(self._size)
         sums, *others = self._buffers.device.get_all([self._sums, *others])
         self._sent.clear()
@@ -123,10 +130,14 @@ class LbfgsSteps:
             self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
 
     def take_blocks(self, blocks):
-        """Sets the CurvatureBlocks of all sources (S)."""
+        """Sets the CurvatureBlocks and ScaleDirections of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []
+        self._set_directions(
+            {s: some[-1].values for s, some in enumerate(blocks) if _has_direction(some)}
+        )
+        blocks = [some[:-1] if _has_direction(some) else some for some in blocks]
         self.shelf.retain([block for some in blocks for block in some])
         listed = [(s, block) for s, some in enumerate(blocks) for block in some]
         for level in range(1 + max((block.level for _, block in listed), default=-1)):
@@ -142,3 +153,20 @@ class LbfgsSteps:
                 "more": level > 0,
             }
             self._levels.append(((self._size[0], len(own)), given))
+
+    def _set_directions(self, directions):
+        """Uploads {source: direction (n,)}."""
+        b, start, scene = self._buffers, self._latents.start, self._buffers.host_boxes.scene
+        self._directions = []
+        if directions:
+            d = np.zeros(self._vector_size)
+            for s, values in directions.items():
+                d[start[s] : start[s] + len(values)] = values
+            ranges = [[scene[s], start[s], len(values)] for s, values in directions.items()]
+            given = {"ranges": b.device.put(np.array(ranges), np.int32), "d": b.put(d)}
+            self._directions.append(((self._size[0], len(ranges)), given))
+
+
+def _has_direction(blocks):
+    """Whether the last of a source's blocks is a ScaleDirection."""
+    return bool(blocks) and isinstance(blocks[-1], ScaleDirection)
