@@ -41,10 +41,11 @@ def documented(tree):
                 yield getattr(node, "name", "the module"), docstring
 
 
-@pytest.mark.parametrize("path", TREES)
-def test_first_lines_are_one_sentence_on_one_line(path):
-    found = {name: faults_of(text) for name, text in documented(TREES[path])}
-    assert {name: faults for name, faults in found.items() if faults} == {}
+def test_first_lines_are_one_sentence_on_one_line():
+    found = {
+        (path, name): faults_of(text) for path in TREES for name, text in documented(TREES[path])
+    }
+    assert len(found) > 1000 and {one: faults for one, faults in found.items() if faults} == {}
 
 
 @pytest.mark.parametrize(
