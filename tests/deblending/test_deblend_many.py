@@ -25,7 +25,6 @@ from clresample.sky.psf import PSF
 from clresample.sky.sources import PointSource
 
 SETTINGS = PaperSettings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
-SHORT = replace(SETTINGS, max_iter=20)
 CORNER = ((28.0, 34.0), (25, 60, 50), 1.6)
 STAR = ((5.0, 20.0), (40, 30, 60), 0)
 
@@ -54,10 +53,10 @@ def fit(b, device, settings=SETTINGS, **given):
 @pytest.mark.parametrize(
     "settings",
     [
-        SHORT,
-        replace(SHORT, fit_sky=True),
-        replace(SHORT, fit_shifts=True),
-        replace(SHORT, prior=None),
+        SETTINGS,
+        replace(SETTINGS, fit_sky=True),
+        replace(SETTINGS, fit_shifts=True),
+        replace(SETTINGS, prior=None),
     ],
     ids=["plain", "sky", "shifts", "free"],
 )
