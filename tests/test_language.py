@@ -49,10 +49,13 @@ def documented(tree):
                 yield getattr(node, "name", "the module"), docstring
 
 
-@pytest.mark.parametrize("path", ALL_TREES)
-def test_first_lines_are_one_sentence_on_one_line(path):
-    found = {name: faults_of(text) for name, text in documented(ALL_TREES[path])}
-    assert {name: faults for name, faults in found.items() if faults} == {}
+def test_first_lines_are_one_sentence_on_one_line():
+    found = [
+        (path, name, faults_of(text))
+        for path, tree in ALL_TREES.items()
+        for name, text in documented(tree)
+    ]
+    assert len(found) > 1000 and [one for one in found if one[2]] == []
 
 
 def test_first_lines_of_tests_are_no_questions():

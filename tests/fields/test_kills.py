@@ -16,6 +16,8 @@ def test_disturbed_runs_end_with_the_same_catalogue(monkeypatch):
 
     monkeypatch.setattr(fields, "WRITES", 2)
     monkeypatch.setattr(fields, "WORKERS", 1)  # a process that begins takes a core-second
+    monkeypatch.setattr(fields, "SIZE", 128)  # [px]
+    monkeypatch.setattr(fields, "TALL", 320)  # [px]
     rows = list(fields.soak(2, 3, ("disk", "tile", "write")))
     assert [row["what"] for row in rows] == ["run", "worker", "disk", "tile", "write"]
     assert sum(row["kills"] for row in rows[:2]) >= 1  # a moment may come after the end

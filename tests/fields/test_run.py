@@ -300,13 +300,13 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
 
 def test_groups_shrink_with_the_device_and_leave_the_same_sources(sky, tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "STEP_PX", 32)  # so that this small field has groups of several
-    folder, tmp_path = tmp_path / "all", tmp_path / "few"
-    run_field(mosaics_of(sky), folder)
+    folder, tmp_path, once = tmp_path / "all", tmp_path / "few", FieldOptions(passes=1)
+    run_field(mosaics_of(sky), folder, options=once)
     device, small = get_device(), 8 << 20
     monkeypatch.setattr(search_setup, "DEVICE_PART", device.memory // small)
     for module in (run, options):
         monkeypatch.setattr(module, "MIN_MEMORY", 1 << 20)
-    run_field(mosaics_of(sky), tmp_path)
+    run_field(mosaics_of(sky), tmp_path, options=once)
     n_groups, n_small = (len(list((f / "work").glob("fit-*"))) for f in (folder, tmp_path))
     assert n_small > n_groups
     differences, n_others = compared(folder, tmp_path)

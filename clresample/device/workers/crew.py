@@ -75,7 +75,7 @@ class Crew:
     MAX_FAULTS: ClassVar[int] = 2
 
     @property
-    def busy(self) -> list:
+    def busy(self):
         """Workers that have a task."""
         return [worker for worker in self.workers if worker.task is not None]
 

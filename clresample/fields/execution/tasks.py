@@ -50,6 +50,9 @@ class Backend:
     def begin(self, work):
         """Starts the workers, if they do not run yet, and loads in them the work's modules."""
 
+    def close(self):
+        """Ends what it has started."""
+
     def run(self, work, context, tasks, again=None, stage=""):
         """Yields the Outcome of every task of a TaskKind, as `Crew.outcomes` does."""
         for outcome in self.outcomes(work, context, tasks, again):
