@@ -43,8 +43,11 @@ BRIGHT = evidence(PRIOR, level=1e4)
 @pytest.mark.parametrize("chi2", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("clear", [False, True])
 def test_new_strengths_are_the_fixed_point_of_the_evidence(chi2, clear):
-    """Energies over determined numbers. Misfit makes energies smaller, never larger. Significant
-    structure at the finest scale has a tenth of the prior's weight there, and ignores misfit."""
+    """Energies over determined numbers.
+
+    Misfit makes energies smaller, never larger. Significant structure at the finest scale has a
+    tenth of the prior's weight there, and ignores misfit.
+    """
     resolved, gamma = BRIGHT.resolved_fraction(SPECTRUM), BRIGHT.determined(OLD, SPECTRUM)
     assert (resolved > 0.9).all() and (gamma > 5).all()
     m = np.array([1 if clear else 10, 10]) / resolved**2
