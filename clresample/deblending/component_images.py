@@ -24,7 +24,7 @@ class ComponentImages:
 
     @classmethod
     def cropped(cls, shape, low, images):
-        """ComponentImages of windows that may lie partly or completely outside of the observation."""
+        """ComponentImages of windows that may lie partly or wholly outside of the observation."""
         lows, parts = [], []
         for at, image in zip(low, images, strict=True):
             here, there = intersect_boxes((0, 0), shape[2:], at, image.shape[1:])

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from clresample.deblending.spectra import RIDGE
-from clresample.deblending.start import linearised_scenes as room
+from clresample.deblending.start import linearised_scenes as module
 from clresample.deblending.start.equations import normal_equations
 from clresample.deblending.start.linearised_scenes import LinearisedScenes
 
@@ -103,8 +103,8 @@ def posed(monkeypatch):
         )
 
     def made(fit_sky, scenes=SEEN, slopes=True):
-        monkeypatch.setattr(room, "ComponentBatch", slots)
-        monkeypatch.setattr(room, "boxes_of", lambda chosen, thetas, t: t)
+        monkeypatch.setattr(module, "ComponentBatch", slots)
+        monkeypatch.setattr(module, "boxes_of", lambda chosen, thetas, t: t)
         components = [
             SimpleNamespace(scene=b, index=i, number=k) for k, (b, i, *_) in enumerate(PARTS)
         ]
@@ -258,13 +258,13 @@ def test_channels_of_observations_follow_each_other(monkeypatch, counts):
     """Each observation of all scenes in one Sight; of as many channels as their data have."""
     made = []
     monkeypatch.setattr(
-        room, "SlotObservation", lambda *given: made.append(given) or SimpleNamespace()
+        module, "SlotObservation", lambda *given: made.append(given) or SimpleNamespace()
     )
-    monkeypatch.setattr(room, "LinearisedScenes", lambda *given, fit_sky: given)
-    monkeypatch.setattr(room.Tuning, "of", lambda *given: given)
+    monkeypatch.setattr(module, "LinearisedScenes", lambda *given, fit_sky: given)
+    monkeypatch.setattr(module.Tuning, "of", lambda *given: given)
     op = SimpleNamespace(device="here", dtype="float32")
     views = [[SimpleNamespace(op=op, data=np.zeros((n, 4, 5))) for n in counts] for _ in range(2)]
-    room.linearise(views, [], "precision", 0.1, fit_sky=True)
+    module.linearise(views, [], "precision", 0.1, fit_sky=True)
     ends = np.cumsum([0, *counts]).tolist()
     for k, (own, channels, *rest) in enumerate(made):
         assert own == [scene[k] for scene in views] and channels == slice(ends[k], ends[k + 1])

@@ -37,24 +37,29 @@ def evidence(prior, *, level):
     return SourceEvidence(spectra, prior, profile, np.full((1, len(spectra.weight)), level))
 
 
-BRIGHT = evidence(PRIOR, level=1e4)
+@pytest.fixture
+def bright():
+    return evidence(PRIOR, level=1e4)
 
 
 @pytest.mark.parametrize("chi2", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("clear", [False, True])
-def test_new_strengths_are_the_fixed_point_of_the_evidence(chi2, clear):
-    """Energies over determined numbers. Misfit makes energies smaller, never larger. Significant
-    structure at the finest scale has a tenth of the prior's weight there, and ignores misfit."""
-    resolved, gamma = BRIGHT.resolved_fraction(SPECTRUM), BRIGHT.determined(OLD, SPECTRUM)
+def test_new_strengths_are_the_fixed_point_of_the_evidence(bright, chi2, clear):
+    """Energies over determined numbers.
+
+    Misfit makes energies smaller, never larger. Significant structure at the finest scale has a
+    tenth of the prior's weight there, and ignores misfit.
+    """
+    resolved, gamma = bright.resolved_fraction(SPECTRUM), bright.determined(OLD, SPECTRUM)
     assert (resolved > 0.9).all() and (gamma > 5).all()
     m = np.array([1 if clear else 10, 10]) / resolved**2
     misfit = np.array([1 if clear else max(chi2, 1), max(chi2, 1)])
     wanted = np.sqrt((ENERGIES / misfit + m * np.square(PRIOR.strengths)) / (gamma + m))
     assert ((wanted > OLD / 4) & (wanted < 4 * OLD)).all()
-    found = BRIGHT.learned(OLD, ENERGIES, SPECTRUM, chi2, clear=clear)
+    found = bright.learned(OLD, ENERGIES, SPECTRUM, chi2, clear=clear)
     np.testing.assert_allclose(found, wanted)
     if clear and chi2 > 1:
-        assert found[0] > 1.2 * BRIGHT.learned(OLD, ENERGIES, SPECTRUM, chi2)[0]
+        assert found[0] > 1.2 * bright.learned(OLD, ENERGIES, SPECTRUM, chi2)[0]
 
 
 @pytest.mark.parametrize(
@@ -73,12 +78,12 @@ def test_new_strengths_are_limited(strengths, old, energies, wanted):
 
 
 @pytest.mark.parametrize("excess, clear", [(0.01, True), (-0.01, False)])
-def test_structure_is_significant_beyond_the_number_that_the_data_determine(excess, clear):
-    gamma = BRIGHT.determined(OLD, SPECTRUM)[0]
+def test_structure_is_significant_beyond_what_the_data_determine(bright, excess, clear):
+    gamma = bright.determined(OLD, SPECTRUM)[0]
     assert gamma > 0.2 * MIN_SIGNIFICANCE  # else the test could not tell one from the other
     energies = np.array([(gamma + MIN_SIGNIFICANCE + excess) * OLD[0] ** 2, 0.0])
-    assert BRIGHT.is_clear(OLD, energies, SPECTRUM) == clear
-    assert not BRIGHT.is_clear(OLD, np.array([0.0, 1e9]), SPECTRUM)  # at the finest scale alone
+    assert bright.is_clear(OLD, energies, SPECTRUM) == clear
+    assert not bright.is_clear(OLD, np.array([0.0, 1e9]), SPECTRUM)  # at the finest scale alone
 
 
 def test_what_is_not_seen_stays_as_it_was_expected():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.told import Told, learning
 
-from clresample.deblending import iterate as room
+from clresample.deblending import iterate as module
 from clresample.deblending.iterate import (
     CHECK_ITERATIONS,
     MIN_GAIN,
@@ -20,7 +20,7 @@ from clresample.paper import run as paper_run
 @pytest.fixture(autouse=True)
 def no_exchange(monkeypatch):
     """No sources share light."""
-    monkeypatch.setattr(room, "make_joint_step", lambda *given: None)
+    monkeypatch.setattr(module, "make_joint_step", lambda *given: None)
 
 
 def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
@@ -34,7 +34,7 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
         made.append((fit.name, scene, state, findings))
         return SimpleNamespace(step=lambda x: (x, 0, 0, gains[fit.name]))
 
-    monkeypatch.setattr(room, "make_joint_step", exchange_of)
+    monkeypatch.setattr(module, "make_joint_step", exchange_of)
     one = learning([39, 39, 12], converged=[False, False, True], loss_tol=2.5, max_iter=200)
     p, every = one.engine.progress, np.ones(3, bool)
     one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
@@ -136,8 +136,10 @@ def test_shifts_are_made_where_they_gain_part_of_what_ends_a_fit(monkeypatch):
         return steps, part * gains[scene]
 
     asked = []
-    monkeypatch.setattr(room, "shift_steps", shift_steps)
-    monkeypatch.setattr(room, "extrapolate", lambda new, last: asked.append(last.max()) or 3 * new)
+    monkeypatch.setattr(module, "shift_steps", shift_steps)
+    monkeypatch.setattr(
+        module, "extrapolate", lambda new, last: asked.append(last.max()) or 3 * new
+    )
     one.shift()
     assert one.engine.followed == [[True, False, True]] and asked == [9, 9]
     np.testing.assert_array_equal(one.fits[0].shifts, 3 * steps)
@@ -241,7 +243,7 @@ def test_ctrl_c_settles_those_that_go_on(monkeypatch):
     one = running(3, live=[True, False, True])
     one.run = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
     clock = iter([10.0, 13.0, 13.0, 13.0])
-    monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     iterate(one.fits, SimpleNamespace(start_run=lambda *_: one, max_iter=9), None, None)
     assert [f.status == "interrupted" for f in one.fits] == [True, False, True]
     assert [f.ended is not None for f in one.fits] == [True, False, True]

@@ -100,8 +100,10 @@ def solved(found, slopes, fit_sky):
 
 @pytest.mark.parametrize("fit_sky", [False, True])
 def test_a_step_leads_to_the_minimum_of_all_that_is_free(fit_sky, monkeypatch):
-    """By the dense matrix; with spectra at their bound, other ones, none. One set of bounds is
-    factored once."""
+    """By the dense matrix; with spectra at their bound, other ones, none.
+
+    One set of bounds is factored once.
+    """
     factored, factor = [], joint_step.BlockCholesky
     monkeypatch.setattr(joint_step, "BlockCholesky", lambda m: factored.append(m) or factor(m))
     one = posed()
@@ -123,8 +125,10 @@ def test_a_step_leads_to_the_minimum_of_all_that_is_free(fit_sky, monkeypatch):
 
 @pytest.mark.parametrize("part, stays", [(1.0, False), (1e-4, False), (2e-5, True), (0.0, True)])
 def test_a_channel_that_hardly_weighs_stays(part, stays):
-    """Spectra and level of one with less than 1e-9 of the best one's information. The level follows
-    by no more than the light that is moved."""
+    """Spectra and level of one with less than 1e-9 of the best one's information.
+
+    The level follows by no more than the light that is moved.
+    """
     one = posed()
     found = exchange_at(one, (1.0, part, 1.0))
     _, spectra, sky, _ = found.step(slopes_of(one))

@@ -1,5 +1,7 @@
-"""Components of several scenes as observations see them, and their spectra, each scene alone and in
-whole frames of float64."""
+"""Components of several scenes rendered in observations, and their spectra.
+
+Each scene is compared with itself alone, in whole frames of float64.
+"""
 
 from dataclasses import replace
 

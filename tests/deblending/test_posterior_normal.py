@@ -82,8 +82,10 @@ def dense(scene, exposures, images, spectra, layout):
 @pytest.mark.parametrize("n_shifts", [0, 2])
 @pytest.mark.parametrize("bright", [1.0, 3e3])
 def test_the_normal_matrix_is_that_of_whole_frames(n_sky, n_shifts, bright):
-    """Of modes, spectra, sky levels and a shift; sums of bright sources are float64's. With several
-    threads it is the same bit by bit."""
+    """Of modes, spectra, sky levels and a shift; sums of bright sources are float64's.
+
+    With several threads it is the same bit by bit.
+    """
     rng = np.random.default_rng(1)
     counts = np.array([3, 1, 0, 2, 2])
     images = [

@@ -81,9 +81,11 @@ def test_misfit_makes_no_galaxy_more_like_its_profile(alone, wanted):
 
 @pytest.mark.parametrize("level, share", [(0.0, 0.0), (0.1, 1 / 22), (9.0, 0.45)])
 def test_structure_is_stronger_where_light_may_be_a_neighbours(level, share):
-    """By a fifth where a fifth of its light is others', in proportion below. A neighbour of
-    0.1 over half of a source has 1 / 11 of the light there; one beside it has none, nor has the
-    source's second component."""
+    """By a fifth where a fifth of its light is others', in proportion below.
+
+    A neighbour of 0.1 over half of a source has 1 / 11 of the light there; one beside it has none,
+    nor has the source's second component.
+    """
     own, half = np.ones((4, 6)), np.ones((4, 3))
     boxes, spectra = [(5, 5), (5, 8), (5, 11), (5, 5)], np.outer([1, level, 20, 5], [3.0, 4.0])
     one = solution(boxes, [own, half, half, own], spectra=spectra)

@@ -1,5 +1,4 @@
-"""Real blends, HST F814W with HSC grizy from detection to residuals, and one of HSC's from its
-catalogue: what they must reach."""
+"""Real blends: HST F814W with HSC grizy, from detection to residuals, and one of HSC alone."""
 
 import numpy as np
 import pytest
@@ -99,8 +98,11 @@ def test_it_writes_the_figure(fitted):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, seed):
-    """The brightest ones are spirals that need two components. Where smooth profiles of these are
-    all that the second fit begins with, it ends at 1.29 in g, and creeps."""
+    """The brightest ones are spirals that need two components.
+
+    Where smooth profiles of these are all that the second fit begins with, it ends at 1.29 in g,
+    and creeps.
+    """
     if any(word in get_device().name.lower() for word in SIMULATED):
         pytest.skip(f"{get_device().name} takes minutes")
     observation, sources = hsc_blend(data)

@@ -1,5 +1,8 @@
-"""Scenes as linear operators, by each way of rendering: against the operator on composed frames,
-under the dot test, and what is chosen; on CPUs' builds and on GPUs'."""
+"""Scenes as linear operators, by each method of rendering, on builds for CPUs and for GPUs.
+
+They are compared with the operator on composed frames and pass the dot test; the selection of
+the method is tested too.
+"""
 
 import numpy as np
 import pytest

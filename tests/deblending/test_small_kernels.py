@@ -1,5 +1,7 @@
-"""Kernels that are one formula each, against NumPy: terms and spectra, windows, turned spectra; on
-CPUs' builds and on GPUs', in buffers that show what was not written."""
+"""Kernels of one formula each against NumPy, on builds for CPUs and for GPUs.
+
+Terms and spectra, windows, turned spectra; in buffers that reveal elements that were not written.
+"""
 
 import numpy as np
 import pytest
@@ -12,8 +14,10 @@ from clresample.device.tuning import Tuning
 
 @pytest.fixture
 def queue(build, monkeypatch):
-    """Queue a kernel by its file, name and number of pixels (x, y, items); what it leaves of NumPy
-    arrays that are given by name is looked at with `get`."""
+    """Queues a kernel by its file, name and number of pixels (x, y, items).
+
+    NumPy arrays are arguments by name; `get` returns them after the kernel.
+    """
     fill_with_nan(monkeypatch)
     guards = Guards(monkeypatch)
 

@@ -1,5 +1,4 @@
-"""The start's kernels in NumPy: profiles, windows at all edges, sums over them; on CPUs' builds and
-on GPUs'."""
+"""The start's kernels against NumPy: profiles, windows, sums; on builds for CPUs and GPUs."""
 
 from types import SimpleNamespace
 

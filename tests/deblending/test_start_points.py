@@ -1,5 +1,4 @@
-"""From sources to components, and from what was solved to starting points; what is far from light:
-on numbers made by hand."""
+"""Components of sources, starting points, and sources far from light, on numbers made by hand."""
 
 from types import SimpleNamespace
 

@@ -33,10 +33,20 @@ from clresample.paper.solver.scene import UNSEEN
 from clresample.sky.sources import ExtendedSource, PointSource
 
 HOME, BIG = frame(), (1000, 900)
-GALAXY, STAR = GalaxyProfile(HOME), StarProfile(HOME, free=True)
 IMAGE = np.zeros((20, 30))
 IMAGE[[5, 5, 11, 0], [6, 9, 8, 0]] = 8.0, -2.0, 1.5, 0.5
-GIVEN = FixedProfile(IMAGE)
+
+
+def galaxy(*args, **given):
+    return GalaxyProfile(HOME, *args, **given)
+
+
+def star(free=True):
+    return StarProfile(HOME, free=free)
+
+
+def fixed(image=IMAGE):
+    return FixedProfile(image)
 
 
 def component(shape, scene=0, index=0, frame=BIG):
@@ -90,33 +100,24 @@ def test_first_elements_of_arrays_one_after_another():
         cumulative_offsets(np.array([2**30, 2**30]))
 
 
-THETA = np.array([0.7, 0.3, -0.2, 1.5])
-
-
-@pytest.mark.parametrize(
-    "shape, theta, peak",
-    [
-        (STAR, np.zeros(2), MODEL_PSF.images.max()),
-        (GALAXY, THETA, GALAXY.draw(THETA, (20, 20), (41, 41))[0][20, 20]),
-        (FixedProfile(np.array([[1.0, 3.0], [4.0, 2.0]])), np.zeros(0), 0.4),
-    ],
-)
-def test_peaks_are_those_of_drawn_profiles(shape, theta, peak):
-    beside = [component(GIVEN), component(shape), component(GALAXY)]
-    found = peaks_of(beside, [np.zeros(0), theta, GALAXY.mean])
-    assert found[1] == pytest.approx(peak) and found[0] == 1
+def test_peaks_are_those_of_drawn_profiles():
+    theta, square = np.array([0.7, 0.3, -0.2, 1.5]), np.array([[1.0, 3.0], [4.0, 2.0]])
+    shapes = [star(), galaxy(), fixed(square)]
+    found = peaks_of([component(shape) for shape in shapes], [np.zeros(2), theta, np.zeros(0)])
+    drawn = shapes[1].draw(theta, (20, 20), (41, 41))[0]
+    np.testing.assert_allclose(found, [MODEL_PSF.images.max(), drawn[20, 20], 0.4])
 
 
 def test_galaxies_reach_as_far_as_they_are_above_the_threshold():
     """Along both axes, of a turned ellipse with wings."""
     theta, part = np.array([0.9, 0.3, -0.4, 1.2]), 0.01
-    image = GALAXY.draw(theta, (100, 100), (201, 201))[0]
+    image = galaxy().draw(theta, (100, 100), (201, 201))[0]
     half = galaxy_reach(theta[None], psf_second_moment(MODEL_PSF)[None], np.array([part]))[0]
     for axis in (0, 1):
         along = np.flatnonzero((image > part * image.max()).any(axis=1 - axis))
         assert along[-1] - 100 <= half[axis] < along[-1] - 98
-    np.testing.assert_allclose(GALAXY.bounding_box(theta, (3.0, 4.0), part), [(3, 4), half])
-    box = boxes_of([component(GALAXY)], [theta], np.array([part]))[0]
+    np.testing.assert_allclose(galaxy().bounding_box(theta, (3.0, 4.0), part), [(3, 4), half])
+    box = boxes_of([component(galaxy())], [theta], np.array([part]))[0]
     assert box == box_about((14.3, 17.6), half, BIG)
 
 
@@ -125,43 +126,44 @@ PATCH = np.arange(12.0).reshape(3, 4)
 
 
 @pytest.mark.parametrize(
-    "shape, theta, threshold, middle, half",
+    "kind, theta, threshold, middle, half",
     [
         # a star: its image, or 0.002 px over the threshold of its rings, and a pixel
-        (STAR, [0.5, -0.25], 0.01, (3.5, 3.75), (HALF, HALF)),
-        (STAR, [0.5, -0.25], 2e-5, (3.5, 3.75), (101, 101)),
-        (GIVEN, [], 1 / 16, (8, 7.5), (4, 2.5)),  # to the faintest pixel above the threshold
-        (_ImageProfile(PATCH, (5, 7), (160, 160)), [], None, (79.5, 79.5), (160, 160)),
-        (_ImageProfile(PATCH, (5, 7), (161, 160)), [], None, (6, 8.5), (1.5, 2)),
+        (star, [0.5, -0.25], 0.01, (3.5, 3.75), (HALF, HALF)),
+        (star, [0.5, -0.25], 2e-5, (3.5, 3.75), (101, 101)),
+        (fixed, [], 1 / 16, (8, 7.5), (4, 2.5)),  # to the faintest pixel above the threshold
+        (lambda: _ImageProfile(PATCH, (5, 7), (160, 160)), [], None, (79.5, 79.5), (160, 160)),
+        (lambda: _ImageProfile(PATCH, (5, 7), (161, 160)), [], None, (6, 8.5), (1.5, 2)),
     ],
 )
-def test_reach_of_other_profiles(shape, theta, threshold, middle, half):
-    found = shape.bounding_box(np.array(theta), np.array([3.0, 4.0]), threshold)
+def test_reach_of_other_profiles(kind, theta, threshold, middle, half):
+    found = kind().bounding_box(np.array(theta), np.array([3.0, 4.0]), threshold)
     np.testing.assert_allclose(found, [middle, half])
 
 
 def test_images_are_cut_to_boxes():
     one, low, size = _ImageProfile(PATCH, (5, 7), (40, 40)), np.array([4, 8]), np.array([3, 2])
     assert one.draw_box(None, None, low, size).tolist() == [[[0, 0], [1, 2], [5, 6]]]
-    assert GIVEN.draw(None, None).sum() == 1 and GIVEN.peak == 1
+    assert fixed().draw(None, None).sum() == 1 and fixed().peak == 1
 
 
-WIDE = GalaxyProfile(HOME, 1, 2, widened=6.0)  # of two components, a factor e apart
+SCATTER = [0.4, 0.17, 0.17, 0.7]
 
 
 @pytest.mark.parametrize(
     "shape, mean, scatter",
-    [  # 0.25" on pixels of 0.1", round, wings of 6.5; a star half a pixel about its position
-        (GALAXY, [np.log(2.5), 0, 0, np.log(6.5)], [0.4, 0.17, 0.17, 0.7]),
-        (WIDE, [np.log(15) + 0.5, 0, 0, np.log(6.5)], [0.4, 0.17, 0.17, 0.7]),
-        (STAR, [0, 0], [0.5, 0.5]),
-        (StarProfile(HOME, free=False), [], []),
+    [  # 0.25" on pixels of 0.1", round, wings of 6.5; of two components, a factor e apart
+        (galaxy, [np.log(2.5), 0, 0, np.log(6.5)], SCATTER),
+        (lambda: galaxy(1, 2, widened=6), [np.log(15) + 0.5, 0, 0, np.log(6.5)], SCATTER),
+        (star, [0, 0], [0.5, 0.5]),  # half a pixel about its position
+        (lambda: star(free=False), [], []),
     ],
 )
 def test_expected_parameters_of_profiles(shape, mean, scatter):
-    np.testing.assert_allclose(shape.mean, mean)
-    np.testing.assert_allclose(shape.scatter, scatter)
-    assert mean or shape.center(np.zeros(0), (3.0, 4.0)) == (3.0, 4.0)
+    one = shape()
+    np.testing.assert_allclose(one.mean, mean)
+    np.testing.assert_allclose(one.scatter, scatter)
+    assert mean or one.center(np.zeros(0), (3.0, 4.0)) == (3.0, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +193,7 @@ def test_a_psf_is_drawn_without_its_neighbours_in_the_fft():
 
 def test_slots_of_equal_boxes_follow_each_other():
     """By size, then number of images, then scene; runs end where any of these changes."""
-    shapes = [GALAXY, StarProfile(HOME, free=False), GALAXY, GALAXY, GALAXY]
+    shapes = [galaxy(), star(free=False), galaxy(), galaxy(), galaxy()]
     chosen = [component(*one) for one in zip(shapes, [1, 0, 0, 1, 0], range(5), strict=True)]
     thetas = [np.zeros(len(shape.mean)) for shape in shapes]
     boxes = [((0, 0), (n, m)) for n, m in ((24, 24), (24, 24), (40, 24), (24, 24), (24, 40))]
@@ -237,9 +239,9 @@ def test_dark_positions_have_under_3_sigma_in_every_channel_and_in_all():
 
 
 @pytest.mark.parametrize("centre", [(14.3, 17.6), (-0.4, 35.4), (29.4, 0.0)])
-@pytest.mark.parametrize("shape", [STAR, GALAXY])
-def test_the_peak_of_a_profile_is_its_largest_pixel_on_the_frame(shape, centre):
-    place = np.array(centre)
+@pytest.mark.parametrize("kind", [star, galaxy])
+def test_the_peak_of_a_profile_is_its_largest_pixel_on_the_frame(kind, centre):
+    shape, place = kind(), np.array(centre)
     wanted = shape.draw(shape.mean, place)[0].max()
     found = profile_peak(shape, shape.mean, place, place, HOME.shape)
     assert found == pytest.approx(wanted, rel=1e-4)

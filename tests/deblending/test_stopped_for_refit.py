@@ -60,8 +60,10 @@ def test_ctrl_c_interrupts_fits_that_wait_to_be_taken_over(monkeypatch):
 
 
 def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better(monkeypatch):
-    """Then with the shifts that it had, and no less time; the better one is kept in the end. Second
-    ones may take twice as many iterations."""
+    """Then with the shifts that it had, and no less time; the better one is kept in the end.
+
+    Second ones may take twice as many iterations.
+    """
     firsts = [named(k, Ended.REFIT, shifts=float(k)) for k in range(4)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 2)}
     monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: again)

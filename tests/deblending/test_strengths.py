@@ -1,5 +1,7 @@
-"""A batch's strengths and what its operators say to them, source by source and in NumPy: misfit,
-answers to one pixel, what is learned by which scene; and how large its launches are."""
+"""A batch's strengths and the responses of its operators, against NumPy source by source.
+
+Misfit, responses to one pixel, the updates of each scene, and the sizes of launches.
+"""
 
 from dataclasses import replace
 

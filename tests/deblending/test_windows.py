@@ -1,5 +1,8 @@
-"""Large scenes in windows: against the operator on composed frames, under the dot test, with shifts
-and in parts, and when they are chosen; on CPUs' builds and on GPUs'."""
+"""Large scenes in windows, on builds for CPUs and for GPUs.
+
+They are compared with the operator on composed frames and pass the dot test, with shifts and in
+parts; their selection is tested too.
+"""
 
 import numpy as np
 import pytest
@@ -33,8 +36,10 @@ def in_windows(kind, pairs, device, dtype, parts=None):
 
 
 def away(op, pairs, device):
-    """Largest difference, in the largest value, from the operators on composed frames, where these
-    cover the observation."""
+    """Largest difference, over the largest value, from the operators on composed frames.
+
+    Pixels that these do not cover are left out.
+    """
     b = op.buffers
     found = op.forward(device.get(b.morph if isinstance(op, MorphologyOperator) else b.spectra))
     worst = 0.0

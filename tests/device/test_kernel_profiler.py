@@ -84,8 +84,10 @@ def test_products_of_folded_images_are_counted(profiled, spread):
 
 
 def test_seconds_are_those_of_the_device(profiled):
-    """Ten times the work takes longer, and all of it no longer than the clock on the wall. Of each
-    the quickest of several runs counts: other processes may hold the cores in any of them."""
+    """Ten times the work takes longer, and all of it no longer than the clock on the wall.
+
+    Of each the quickest of several runs counts: other processes may hold the cores in any of them.
+    """
     from time import perf_counter
 
     if "llvmpipe" in profiled.name:

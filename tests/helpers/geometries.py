@@ -24,8 +24,11 @@ TOLERANCE = {np.float32: 2e-6, np.float64: 1e-12}
 
 
 def tolerance(device, dtype):
-    """Of the paper's scheme: its PSFs are interpolated on the device, in float32 where it has no
-    float64, and their transfer function then has errors of a few 1e-6."""
+    """Tolerance of the paper's scheme.
+
+    Its PSFs are interpolated on the device, in float32 if it has no float64, so that their transfer
+    function has errors of a few 1e-6.
+    """
     return TOLERANCE[np.dtype(dtype).type] * (1 if device.has_fp64 else 5)
 
 

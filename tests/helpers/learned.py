@@ -4,8 +4,10 @@ import numpy as np
 
 
 def kernel(n_pixels, taps, step):
-    """K_j along one axis (n_pixels, n coefficients): taps about every step-th pixel, times root
-    of step."""
+    """K_j along one axis (n_pixels, n coefficients).
+
+    They are the taps about every step-th pixel, times the square root of the step.
+    """
     n, radius = (n_pixels + step - 2) // step + 1, len(taps) // 2
     away = np.arange(n_pixels)[:, None] - step * np.arange(n)
     near = np.abs(away) <= radius

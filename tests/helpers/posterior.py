@@ -106,8 +106,10 @@ def dense_error(kept, i):
 
 
 def _dense_modes(posterior, i):
-    """Modes of component i: a normal number for each pixel, and its profile's own slopes; and by
-    how much each changes the light beyond its box (k,)."""
+    """Modes of component i: a normal number for each pixel, and its profile's own slopes.
+
+    Returns also the change of the light beyond its box by each (k,).
+    """
     s, n_slopes = posterior.solution, 8
     profile = s.scene.profile[i]
     n = profile.size

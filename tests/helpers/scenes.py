@@ -54,8 +54,10 @@ def observe(
     sky=(0, 0, 0),
     unit=1.0,
 ):
-    """Observations "e" (v) and "r" (g, r) of objects, the second moved by `shift` [model px]; made
-    in float64 where the device has it."""
+    """Observations "e" (v) and "r" (g, r) of objects, the second moved by `shift` [model px].
+
+    They are made in float64 if the device has it.
+    """
     rng, model, found = np.random.default_rng(seed), truth(objects, shape), []
     dtype = np.float64 if get_device().has_fp64 else np.float32
     for k, (grid, psf) in enumerate(zip(grids(shape, angle), psfs, strict=True)):
@@ -117,10 +119,13 @@ def chi2(result):
 
 
 def alike(together, alone, dtype=np.float32):
-    """Two results are equal, to what sums leave after 30 steps: each of these divides a gradient by
-    its own size, so the rounding of the smallest gradients makes steps of the usual length. In
-    float64, to what starts leave: windows that several scenes share are larger, and hold 1e-8 more
-    of the light, 3e-7 of the loss after all steps of the start."""
+    """Asserts that two results are equal within the rounding of 30 steps.
+
+    Each step divides a gradient by its own size, so that the rounding of the smallest gradients
+    makes steps of the usual length. In float64 the limit is that of starts: windows that
+    several scenes share are larger, and contain 1e-8 more of the light, 3e-7 of the loss after
+    all steps of the start.
+    """
     close = dtype == np.float64
     assert together.frame.shape == alone.frame.shape and together.status == alone.status
     np.testing.assert_allclose(together.losses, alone.losses, rtol=3e-7 if close else 1e-3)

@@ -84,8 +84,10 @@ def changed(scene, state, **given):
 
 
 def ragged(device, dtype):
-    """Scenes of 3, 1 and 5 sources, one with PSFs of its own; a star; boxes at all edges, and of
-    one pixel; dark pixels, and spectra next to zero."""
+    """Scenes of 3, 1 and 5 sources, one of them with PSFs of its own.
+
+    They have a star, boxes at all edges and of one pixel, dark pixels, and spectra next to zero.
+    """
     pairs = [
         posed(device, dtype, seed=1, fixed=(1,)),
         posed(device, dtype, seed=2, boxes=BOXES[4:], psfs=PSFS),

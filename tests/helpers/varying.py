@@ -15,8 +15,10 @@ def widening(y, x):
 
 
 def stamp(psf, band, place, shape):
-    """A star at place (y, x) of an image: the PSF's samples moved by their Fourier series, whose
-    light is all on the stamp."""
+    """A star at place (y, x) of an image: the PSF's samples moved by their Fourier series.
+
+    All of its light is on the stamp.
+    """
     n_y, n_x = psf.images.shape[1:]
     image, corner = np.zeros(shape), np.floor(np.array(place) - psf.center[band] + 0.5).astype(int)
     nu_y, nu_x = np.fft.fftfreq(n_y)[:, None], np.fft.fftfreq(n_x)

@@ -95,8 +95,10 @@ def two_widths():
 
 
 def test_objects_have_a_quarter_of_the_square_of_their_images_fwhm(monkeypatch):
-    """The sharpest first; of all together that of the sharpest. A peak counts as a known source
-    within 0.7 FWHM of the image, of the widest for all together."""
+    """The sharpest first; of all together that of the sharpest.
+
+    A peak counts as a known source within 0.7 FWHM of the image, of the widest for all together.
+    """
     pytest.importorskip("sep")
     given = []
 

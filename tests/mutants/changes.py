@@ -74,8 +74,11 @@ C_TYPES = {"REAL", "float", "double", "int", "uint", "long", "ulong", "char", "v
 
 @dataclass(frozen=True)
 class Mutation:
-    """`old` at character `start` of a file became `new`; `shown` is the file's line before it, on
-    which this is number `place`, from 1, of equal changes."""
+    """A change of one token of a file.
+
+    `old` at character `start` became `new`. `shown` is the file's line before it, on which it is
+    number `place`, from 1, of equal changes.
+    """
 
     path: Path
     line: int

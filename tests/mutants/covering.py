@@ -71,8 +71,9 @@ class Covering:
         return tests
 
     def tests(self, mutation):
-        """The tests that may notice a Mutation, where a build of kernels for groups of work-items
-        counts as a test of its own.
+        """The tests that may notice a Mutation.
+
+        A build of kernels for groups of work-items counts as a test of its own.
 
         Quick ones come first, and those that run little else: they look at this alone. The second
         variant of a test counts as twice as slow, the third as three times: one of each test comes

@@ -1,5 +1,8 @@
-"""Constraints by one work-item a source and by groups of them: each pixel counts, the largest
-wherever it lies; nothing beyond the boxes is written or read."""
+"""Constraints by one work-item a source and by groups of them.
+
+Each pixel counts, and the largest is found wherever it lies; nothing beyond the boxes is written
+or read.
+"""
 
 import numpy as np
 import pytest

@@ -1,5 +1,7 @@
-"""The proximal operators: each answers as its NumPy reference, over sources of many shapes at once,
-and is a prox or a projection where it says so."""
+"""The proximal operators against their NumPy references, over sources of many shapes at once.
+
+Each is a proximal operator or a projection, as it states.
+"""
 
 import numpy as np
 import pytest

@@ -1,5 +1,7 @@
-"""Loss and gradients on the device: kernels as their references, slopes as finite differences; on
-CPUs' builds and on GPUs'."""
+"""Loss and gradients on the device against references, on builds for CPUs and for GPUs.
+
+Slopes are compared with finite differences.
+"""
 
 import numpy as np
 import pytest

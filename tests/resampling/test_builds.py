@@ -1,5 +1,7 @@
-"""Operators through the kernels as they are built for CPUs and for GPUs, in buffers that hold NaN
-until they are written and show writes beyond their end."""
+"""Operators with kernels as built for CPUs and for GPUs, in guarded buffers.
+
+Buffers hold NaN until they are written, and reveal writes beyond their end.
+"""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""Operators made once for each geometry: asked again they cost nothing, and they are not kept for
-ever."""
+"""Operators made once for each geometry: repeated requests cost nothing, old ones are dropped."""
 
 import gc
 from types import SimpleNamespace

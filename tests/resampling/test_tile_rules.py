@@ -167,8 +167,10 @@ def test_waves_of_the_papers_scheme():
 
 
 def test_slabs_fit_the_cache_and_the_largest_buffer(device, monkeypatch):
-    """But for a unit by which they may differ; they are no more than that takes. As many images go
-    together as fit with them."""
+    """But for a unit by which they may differ; they are no more than that takes.
+
+    As many images go together as fit with them.
+    """
     mapping, pair = GEOMETRIES["30 degrees"](), psfs()
     found = PaperResampler.from_mapping(mapping, *pair, device=device)._factors
     model, kernel = (found.n_terms * n * 4 for n in (found.n_cols, found.l_pad))  # [bytes]

@@ -18,10 +18,10 @@ from .scene import AmsgradMoments
 # Decay of the moments of gradients and of their squares (Reddi et al. 2018's defaults, as in the
 # paper's solver): an average over the last 10 and the last 1000 iterations.
 BETA1, BETA2 = 0.9, 0.999
-# Fraction of AmsgradScene.damping by which steps are damped. The damping is a bound on the curvature, in
-# most scenes twice the largest curvature (see curvature.py), so all of it would make steps too
-# short. Without damping, steps of one length for all pixels would move a bright source far away
-# from a good start.
+# Fraction of AmsgradScene.damping by which steps are damped. The damping is a bound on the
+# curvature, in most scenes twice the largest curvature (see curvature.py), so all of it would make
+# steps too short. Without damping, steps of one length for all pixels would move a bright source
+# far away from a good start.
 DAMPING = 0.3
 DECAY = {"B1": BETA1, "B2": BETA2}  # as macros
 N_MOMENTS = 3  # m, v, h
