@@ -31,8 +31,9 @@
 #define RAGGED 0
 #endif
 /* ON_CPU: a tile's sums are copied to memory once they are complete, and a loop over them follows;
- * epilogues and OWN are arguments. So few and small builds serve all products: with everything
- * unrolled, and a build for each product, a first fit compiled for 18 core-seconds, now for 8. */
+ * epilogues, OWN and RAGGED are arguments. So few and small builds serve all products: with
+ * everything unrolled, and a build for each product, a first fit compiled for 18 core-seconds, now
+ * for 8. */
 #ifndef ON_CPU      /* 1: as said above; 0: for GPUs, whose sums stay in registers */
 #define ON_CPU 0
 #endif

@@ -8,8 +8,7 @@ from functools import partial
 def free_parameters(package, scene, *, spectrum, morphology):
     """Lets the spectra and morphologies of a scarlet2 Scene vary: positive, and in [0, 1].
 
-    package: scarlet2; spectrum: step relative to the spectrum; morphology: step,
-        or a function of the morphology that returns it
+    package: scarlet2; spectrum: step relative to the spectrum; morphology: step
     """
     import numpyro.distributions.constraints as constraints
 

@@ -101,7 +101,8 @@ class RunProgress:
     """Progress callbacks of a field run; override those you need.
 
     stage(name, total): a stage begins, with the number of its tiles or blends; step(n, sources): n
-    of them are done; message(text): a line for the user; dashboard(address): page of the workers
+    of them are done; time_left(seconds): before a step, the predicted time to the end of the stage;
+    message(text): a line for the user; dashboard(address): page of the workers
     """
 
     def stage(self, name, total):
@@ -110,6 +111,9 @@ class RunProgress:
 
     def step(self, n, sources=0):
         """Reports that n more tiles or blends of the stage are done, with so many sources."""
+
+    def time_left(self, seconds):
+        """Receives the predicted time [s] to the end of the stage, or None if it is unknown."""
 
     def message(self, text):
         """Receives a message for the user, one line."""

@@ -50,6 +50,14 @@ def test_a_terminal_shows_blends_sources_a_second_and_the_time_left(live):
     text = stream.getvalue()
     assert "16 of 40 blends" in text and "5.0 sources/s" in text
     assert "about 12 s left" in text  # 24 blends at 2 a second
+    shown.time_left(47)
+    clock.now += 5
+    assert shown.speed() == "2.2 sources/s, about 42 s left"
+    shown.stage("pieces", 4)
+    shown.time_left(3)
+    assert "about 3 s left" in stream.getvalue() and shown.speed() == "about 3 s left"
+    clock.now += 4
+    assert shown.speed() == "about 0 s left"
     shown.message("3 blends are set aside")
     shown.dashboard("http://127.0.0.1:8787\x1b[2J")
     lines = stream.getvalue().replace("\r", "\n").splitlines()

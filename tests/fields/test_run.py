@@ -121,10 +121,13 @@ class _Stop(RunProgress):
     """Stops a run as Ctrl-C does, after so many groups of fits."""
 
     def __init__(self, n):
-        self.name, self.left = "", n
+        self.name, self.left, self.predicted_s = "", n, None
 
     def stage(self, name, total):
         self.name = name
+
+    def time_left(self, seconds):
+        self.predicted_s = seconds
 
     def step(self, n, sources=0):
         if self.name == "fit" and n:
@@ -136,8 +139,10 @@ class _Stop(RunProgress):
 def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
     folder, _ = done
     mosaics = mosaics_of(sky)
+    stop = _Stop(1)
     with pytest.raises(KeyboardInterrupt):
-        run_field(mosaics, tmp_path, progress=_Stop(1))
+        run_field(mosaics, tmp_path, progress=stop)
+    assert stop.predicted_s is not None and 0 <= stop.predicted_s < 3600
     parts = sorted((tmp_path / "work").glob("fit-*.fits"))
     assert len(parts) == 1 and not (tmp_path / "catalogue.fits").exists()
     before = parts[0].stat().st_mtime_ns

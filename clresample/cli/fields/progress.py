@@ -32,7 +32,7 @@ class ProgressDisplay(RunProgress):
         self.close()
         self.name, self.total = name, total
         self.done = self.counted = self.sources = 0
-        self.began = self.clock()
+        self.began, self.ends = self.clock(), None
         watched = sys.stderr.isatty() and not self.arguments.quiet
         self.bar = tqdm(
             total=total,
@@ -65,14 +65,25 @@ class ProgressDisplay(RunProgress):
             print_progress(self.arguments, ", ".join(filter(None, [line, self.speed()])))
             self.said = self.clock()
 
+    def time_left(self, seconds):
+        """Keeps the predicted end of the stage, and shows it."""
+        self.ends = None if seconds is None else self.clock() + seconds
+        if not self.bar.disable:
+            self.bar.set_postfix_str(self.speed())
+
     def speed(self):
         """Sources a second and the time left, as far as they are known."""
         seconds = self.clock() - self.began
-        if not self.counted or not seconds > 0:
-            return ""
-        # by the number of blends: the largest are first, so that the estimate is an upper limit
-        left = (self.total - self.done) * seconds / self.counted
-        return f"{self.sources / seconds:.1f} sources/s, about {duration(left)} left"
+        words = []
+        if self.counted and seconds > 0:
+            words.append(f"{self.sources / seconds:.1f} sources/s")
+        if self.ends is not None:
+            left = max(0.0, self.ends - self.clock())
+            words.append(f"about {duration(left)} left")
+        elif words:  # by the number of tiles, which are alike
+            left = (self.total - self.done) * seconds / self.counted
+            words.append(f"about {duration(left)} left")
+        return ", ".join(words)
 
     def message(self, text):
         """A line of its own, above the bar."""

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
 
 from ...device.workers.outcome import Cause
 from ...files.atomic import FileError
+from ..blends.plan import predicted_cost
 from .fitting import fit_group, is_large, mark_failed
 from .group_inputs import FitGroup, gather_inputs
 from .group_results import FOUND_COLUMNS, GroupResultsFile
+from .search_setup import read_search_setup
 from .tasks import TaskKind
+from .time_left import TimeLeft, remember_pace, remembered_pace
 
 # Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
 # light subtracted. Crowded pieces settle in the third or fourth round.
@@ -229,15 +233,29 @@ def _fit_round(job, tasks, engine, progress):
             for few in (group.patches[:half], group.patches[half:])
         ]
 
+    costs = {group.name: _cost(job, group) for group in todo}
+    n_workers = sum(n for _, n in engine.device_shares)
+    alike = f"{read_search_setup(job.folder).devices}, {len(job.channels)} channels, {n_workers}"
+    time_left = TimeLeft(costs, n_workers, time.monotonic(), remembered_pace(alike))
+    progress.time_left(time_left.left(time.monotonic()))
     for outcome in engine.run(FIT, job, todo, again=again, stage="fit"):
         group, value = outcome.task, outcome.value
+        time_left.end(group.name, outcome.worker, outcome.start_s, outcome.end_s)
+        progress.time_left(time_left.left(time.monotonic()))
         if outcome.reason is not None:
             value, content = mark_failed(job, group, outcome.reason)
             FIT.keep(job, group, content)
             progress.message(f"{len(group.patches)} blends are set aside: {outcome.reason}")
         names[group.name] = group.patches
         progress.step(value["patches"], value["sources"])
+    if time_left.pace is not None and tasks[0].round == 0:  # pieces differ from whole blends
+        remember_pace(alike, time_left.pace)
     return names
+
+
+def _cost(job, group):
+    """Predicted relative time of a group's fits."""
+    return sum(predicted_cost(job.plan.patches[number]) for number in group.patches)
 
 
 def _parts_of(folder):

@@ -19,7 +19,8 @@ class Diagram {
     this.bands = magnitudeColumns();
     this.at = -1;  // number of the point under the pointer or chosen by keys
     if (!this.canvas || this.bands.length < 2) { byId("colours")?.setAttribute("hidden", ""); return; }
-    for (const [id, k] of [["colour-a", 0], ["colour-b", 1], ["colour-m", this.bands.length - 1]]) {
+    const first = Math.max(0, this.bands.length - 3);  // neighbouring bands, mostly of one survey
+    for (const [id, k] of [["colour-a", first], ["colour-b", first + 1], ["colour-m", this.bands.length - 1]]) {
       byId(id).append(...this.bands.map(([title, place]) => option(title, place)));
       byId(id).selectedIndex = k;
       byId(id).addEventListener("change", () => this.draw());
