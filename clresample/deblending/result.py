@@ -90,6 +90,10 @@ class Result(ResultDisplay):
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 
+    def __getstate__(self):
+        """Attributes for pickles and copies, without what is large and derived in no time."""
+        return {name: x for name, x in vars(self).items() if name not in _LARGE}
+
     @property
     def converged(self) -> bool:
         """True if the fit converged to a model that describes the data."""
@@ -249,7 +253,8 @@ class Result(ResultDisplay):
 
 
 # Cached properties of a Result that do not depend on its status, messages, errors or draws.
-_DERIVED = "footprints", "unobserved", "misfit"
+_LARGE = "footprints", "unobserved"
+_DERIVED = *_LARGE, "misfit"
 
 
 def noted(result, **given) -> Result:

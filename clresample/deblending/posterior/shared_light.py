@@ -50,7 +50,7 @@ def shape_doubts(posterior, owner, n_sources) -> np.ndarray:
         return np.zeros((n_sources, layout.n_channels, 0))
     at = {i: layout.n_modes[i] + SHAPE_MODES for i in doubted}
     column = {i: 4 * k + np.arange(4) for k, i in enumerate(doubted)}
-    slopes = posterior.fluxes(owner, n_sources)[1]
+    slopes = posterior.flux_slopes
     out = np.zeros((n_sources, layout.n_channels, 4 * len(doubted)))
     for (i, j), block in posterior.covariance.items():
         if j == layout.common:
