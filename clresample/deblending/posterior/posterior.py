@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,7 @@ from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
-from .shared_light import exchanged_light, shape_doubts, with_shared_light
+from .shared_light import exchanged_light, flux_changes, shape_doubts, with_shared_light
 
 # Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
 MIN_ERROR = 1e-9
@@ -209,7 +210,9 @@ def with_errors(fit, result, peaks, seen):
     cores = core_errors(result, fit.settings.psf_error)
     errors = with_core_errors(widened(errors, outside), cores)
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
-    errors = with_shared_light(errors, doubts, exchanged_light(result, start.source, fit.scene))
+    exchanged = exchanged_light(result, start.source, fit.scene)
+    errors = with_shared_light(errors, doubts, exchanged)
+    draws = replace(draws, flux_changes=flux_changes(doubts, exchanged))
     return noted(result, errors=errors, draws=draws)
 
 
