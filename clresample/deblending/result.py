@@ -90,6 +90,10 @@ class Result(ResultDisplay):
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 
+    def __getstate__(self):
+        """Attributes for pickles and copies, without what is large and derived in no time."""
+        return {name: x for name, x in vars(self).items() if name not in _LARGE}
+
     @property
     def converged(self) -> bool:
         """True if the fit converged to a model that describes the data."""
@@ -238,8 +242,9 @@ class Result(ResultDisplay):
 
         They are the fluxes of `sample`, corrected for light beyond the boxes and for the bound at 0
         like those of `fluxes`, so that they scatter about the catalogue's; NaN if not measured.
-        Errors of the catalogue are larger where they also include the division of light between
-        neighbours (posterior/shared_light.py), light outside the images, or a saturated core.
+        They also scatter by what is open of the division of light between neighbours
+        (posterior/shared_light.py), which can make fluxes negative. Errors of the catalogue are
+        larger where they include light outside the images, or a saturated core.
 
         rng: NumPy Generator, or a seed
 
@@ -249,7 +254,8 @@ class Result(ResultDisplay):
 
 
 # Cached properties of a Result that do not depend on its status, messages, errors or draws.
-_DERIVED = "footprints", "unobserved", "misfit"
+_LARGE = "footprints", "unobserved"
+_DERIVED = *_LARGE, "misfit"
 
 
 def noted(result, **given) -> Result:

@@ -7,7 +7,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from ..deblending.posterior.block_matrix import BlockCholesky
-from ..deblending.posterior.errors import PosteriorSampler
+from ..deblending.posterior.errors import FluxChanges, PosteriorSampler
 from ..deblending.posterior.mode_images import CellImages, ModeImages
 from ..deblending.solver.rendering.ties import Ties
 from .array_hdus import array_of, image_hdu
@@ -23,7 +23,8 @@ def draw_hdus(draws):
     their pixels, see ModeImages. DRAWLATER: these neighbours.
     DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated, smooth modes first; the factor
     consists of each node's diagonal block and the block below it, in elimination order. DRAWUNIT,
-    DRAWWIDE, DRAWBANDS: see PosteriorSampler.
+    DRAWWIDE, DRAWBANDS: see PosteriorSampler. DRAWPAIRS, DRAWLIGHT: source and change, and light,
+    of its FluxChanges.
     """
     if draws is None:
         return []
@@ -42,6 +43,10 @@ def draw_hdus(draws):
             arrays.append(images)
     later = [node for nodes in factor.later for node in nodes]
     bands = () if draws.ties is None else draws.ties.bands
+    changes = draws.flux_changes
+    none = changes is None
+    pairs = np.zeros((2, 0), int) if none else np.array([changes.source, changes.change])
+    light = np.zeros((0, len(draws.unit))) if none else changes.by
     return [
         fits.BinTableHDU(Table(rows, names=NODES), name="DRAWNODES"),
         image_hdu("DRAWLATER", np.array(later, np.int64)),
@@ -51,6 +56,8 @@ def draw_hdus(draws):
         image_hdu("DRAWUNIT", draws.unit),
         image_hdu("DRAWWIDE", draws.misfit_scale),
         image_hdu("DRAWBANDS", np.array(bands, np.int64)),
+        image_hdu("DRAWPAIRS", pairs.astype(np.int64)),
+        image_hdu("DRAWLIGHT", light),
     ]
 
 
@@ -72,7 +79,7 @@ def read_draws(hdus, shapes):
         lower[v] = factor.take(sizes[v], sizes[v])
         if later[v]:
             below[v] = factor.take(sum(sizes[u] for u in later[v]), sizes[v])
-    bands = array_of(hdus["DRAWBANDS"])
+    bands, pairs, light = (array_of(hdus[f"DRAW{x}"]) for x in ("BANDS", "PAIRS", "LIGHT"))
     return PosteriorSampler(
         [_modes(modes, *given) for given in zip(shapes, counts, *smooth, strict=False)],
         BlockCholesky.restore(
@@ -81,6 +88,7 @@ def read_draws(hdus, shapes):
         array_of(hdus["DRAWUNIT"]),
         array_of(hdus["DRAWWIDE"]),
         Ties(tuple(bands.tolist())) if len(bands) else None,
+        FluxChanges(*pairs, light) if len(light) else None,
     )
 
 

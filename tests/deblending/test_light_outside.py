@@ -1,5 +1,6 @@
 """Light outside of what was observed: analytic profiles, whose part outside is known."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -109,9 +110,13 @@ def test_noise_at_the_edge_is_no_light_there():
 
 
 def test_copies_of_a_result_keep_what_was_derived_from_its_model():
-    """Positions of its pixels, unobserved pixels, and its misfit; nothing is derived for them."""
+    """Positions of its pixels, unobserved pixels, and its misfit; nothing is derived for them.
+    Pickles derive the first two anew."""
     result = one_source()
     footprints, outside = result.footprints, result.unobserved
     copy = noted(result, status="misfit")
     assert copy.status == "misfit" and copy.footprints is footprints
     assert copy.unobserved is outside and "misfit" not in vars(copy)
+    back = pickle.loads(pickle.dumps(copy))
+    assert not {"footprints", "unobserved"} & set(vars(back))
+    np.testing.assert_array_equal(back.unobserved, outside)

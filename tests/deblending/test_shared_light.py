@@ -11,6 +11,7 @@ from clresample.deblending.posterior.errors import Errors
 from clresample.deblending.posterior.shared_light import (
     MAX_DOUBT,
     exchanged_light,
+    flux_changes,
     with_shared_light,
 )
 from clresample.deblending.result import Component
@@ -62,6 +63,13 @@ def test_exchanged_light_leaves_the_sum_of_two_fluxes_alone():
     found = with_shared_light(errors, doubts, exchanged)
     np.testing.assert_allclose(found.colour[2], doubts[2] @ doubts[2].T)
     np.testing.assert_allclose(found.flux[1, 0, 2], doubts[0, 1] @ doubts[2, 1])
+    changes, rng = flux_changes(doubts, exchanged), np.random.default_rng(0)
+    drawn = np.array([changes.draw(3, rng) for _ in range(4000)])  # (n, S, C)
+    scale = np.sqrt(np.diagonal(found.flux, axis1=1, axis2=2))
+    products = np.einsum("nsc,ntc->cst", drawn, drawn) / len(drawn)
+    correlation = (products - found.flux) / (scale[:, :, None] * scale[:, None])
+    np.testing.assert_allclose(correlation, 0, atol=0.06)
+    assert flux_changes(0 * doubts, 0 * exchanged) is None
     of_both = np.diagonal(found.colour, axis1=1, axis2=2), np.diagonal(found.flux, axis1=1, axis2=2)
     np.testing.assert_allclose(of_both[0], of_both[1].T)
 

@@ -61,6 +61,25 @@ class Errors:
 
 
 @dataclass(frozen=True, eq=False)
+class FluxChanges:
+    """Independent changes of fluxes, of scatter 1, beside those of components; see shared_light.py.
+
+    source, change (m,): whose flux changes by which of them; by (m, C) [counts]: how much
+    """
+
+    source: np.ndarray
+    change: np.ndarray
+    by: np.ndarray
+
+    def draw(self, n_sources, rng):
+        """Changes (S, C) [counts] of all fluxes."""
+        values = rng.standard_normal(self.change.max(initial=-1) + 1)
+        out = np.zeros((n_sources, self.by.shape[1]))
+        np.add.at(out, self.source, values[self.change, None] * self.by)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
 class PosteriorSampler:
     """Means and factors from which samples of the posterior are drawn.
 
@@ -69,6 +88,7 @@ class PosteriorSampler:
     unit (C,) [counts]: unit of the spectra there
     misfit_scale (n,): factor of the scatter of misfitted sources' components, as for their Errors
     ties: Ties of the channels, of B bands; None: B = C
+    flux_changes: of fluxes, beside those of components; None without any
     """
 
     modes: Sequence[np.ndarray | ModeImages]
@@ -76,6 +96,7 @@ class PosteriorSampler:
     unit: np.ndarray
     misfit_scale: np.ndarray
     ties: Ties | None = None
+    flux_changes: FluxChanges | None = None
 
     @cached_property
     def samples(self) -> list[np.ndarray]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
-from .shared_light import exchanged_light, shape_doubts, with_shared_light
+from .shared_light import exchanged_light, flux_changes, shape_doubts, with_shared_light
 
 # Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
 MIN_ERROR = 1e-9
@@ -84,7 +86,8 @@ class Posterior:
             flux_error_floor: see Settings
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
-        flux, slopes = self.fluxes(owner, n_sources)
+        slopes, flux = self.flux_slopes, np.zeros((n_sources, self.layout.n_channels))
+        np.add.at(flux, owner, self.solution.spectra * self._totals[:, None])
         n_channels = len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
         colour = np.zeros((n_sources, n_channels, n_channels))
@@ -128,19 +131,23 @@ class Posterior:
         wide = misfit_error_scale(residuals)[owner]
         return PosteriorSampler(self.modes, self.factor, unit, wide, self.layout.ties)
 
-    def fluxes(self, owner, n_sources):
-        """Fluxes (S, C), and each component's slopes (C, k + B) of its own by its unknowns."""
+    @cached_property
+    def _totals(self):
+        """Light (n,) of the components for spectra of 1."""
+        morphs = self.solution.morphs
+        return np.array([m.sum() + b.sums[0] for m, b in zip(morphs, self.beyond, strict=True)])
+
+    @cached_property
+    def flux_slopes(self):
+        """Slopes (C, k + B) of each component's flux by its unknowns."""
         s, slopes, ties = self.solution, [], self.layout.ties
         of_channels = np.eye(self.layout.n_channels) if ties is None else ties.matrix
-        flux = np.zeros((n_sources, self.layout.n_channels))
         for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
             far = self.beyond[i]
-            total = morph.sum() + far.sums[0]
-            flux[owner[i]] += s.spectra[i] * total
             sums = sums_with(modes, np.ones((1, *morph.shape), modes.dtype))[0]
             by_mode = np.outer(s.spectra[i], sums + far.slopes[0])
-            slopes.append(np.concatenate([by_mode, total * of_channels], axis=1))
-        return flux, slopes
+            slopes.append(np.concatenate([by_mode, self._totals[i] * of_channels], axis=1))
+        return slopes
 
     def _moments(self, owner, n_sources, error):
         """Covariances (S, 5, 5) of centroids and second moments, and their bound bias (S, 5).
@@ -203,7 +210,9 @@ def with_errors(fit, result, peaks, seen):
     cores = core_errors(result, fit.settings.psf_error)
     errors = with_core_errors(widened(errors, outside), cores)
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
-    errors = with_shared_light(errors, doubts, exchanged_light(result, start.source, fit.scene))
+    exchanged = exchanged_light(result, start.source, fit.scene)
+    errors = with_shared_light(errors, doubts, exchanged)
+    draws = replace(draws, flux_changes=flux_changes(doubts, exchanged))
     return noted(result, errors=errors, draws=draws)
 
 

@@ -40,6 +40,8 @@ def drawn_fluxes(result, n, rng):
     for one in found:
         for c, far in zip(drawn_components(result, rng), beyond, strict=True):
             one[c.source] += c.spectrum * (c.morphology.sum(dtype=np.float64) + far)
+        if result.draws.flux_changes is not None:
+            one += result.draws.flux_changes.draw(len(one), rng)
     found[:, undetermined(result)] = np.nan
     return found
 

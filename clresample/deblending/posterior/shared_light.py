@@ -28,6 +28,7 @@ import numpy as np
 from ...sky.box import intersect_boxes
 from ..profiles import GalaxyProfile
 from ..start.population import contamination_factors
+from .errors import FluxChanges
 from .profile_modes import SHAPE_MODES
 
 # Least variance of a parameter under the posterior: a smaller one is rounding.
@@ -50,7 +51,7 @@ def shape_doubts(posterior, owner, n_sources) -> np.ndarray:
         return np.zeros((n_sources, layout.n_channels, 0))
     at = {i: layout.n_modes[i] + SHAPE_MODES for i in doubted}
     column = {i: 4 * k + np.arange(4) for k, i in enumerate(doubted)}
-    slopes = posterior.fluxes(owner, n_sources)[1]
+    slopes = posterior.flux_slopes
     out = np.zeros((n_sources, layout.n_channels, 4 * len(doubted)))
     for (i, j), block in posterior.covariance.items():
         if j == layout.common:
@@ -136,3 +137,20 @@ def with_shared_light(errors, doubts, exchanged):
     given, taken = (np.moveaxis(e, 0, 1) for e in (exchanged, exchanged.swapaxes(0, 1)))
     colour = colour + sum(np.einsum("tsc,tsd->scd", e, e) for e in (given, taken))
     return replace(errors, flux=flux, colour=colour)
+
+
+def flux_changes(doubts, exchanged):
+    """The FluxChanges that scatter as `with_shared_light` adds to errors; None without any.
+
+    doubts (S, C, k), exchanged (S, S, C) [counts]: see there
+    """
+    source, doubt = np.nonzero(doubts.any(axis=1))
+    giver, taker = np.nonzero(exchanged.any(axis=2))
+    if not len(source) + len(giver):
+        return None
+    pairs, light = doubts.shape[2] + np.arange(len(giver)), exchanged[giver, taker]
+    return FluxChanges(
+        np.concatenate([source, giver, taker]),
+        np.unique(np.concatenate([doubt, pairs, pairs]), return_inverse=True)[1],
+        np.concatenate([doubts[source, :, doubt], light, -light]),
+    )
