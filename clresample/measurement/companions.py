@@ -42,6 +42,9 @@ ASYMMETRY = 0.05
 # [sigma] Smallest height of a peak, and its height under the filter of small galaxies. They are
 # high because the noise of both sides enters and many positions are tested.
 MIN_PEAK_SIGMA, MIN_WIDE = 5.0, 6.0
+# [FWHM] Radius within which the level of the residual is measured: wings of large galaxies, beyond
+# REACH_PX, are left in it.
+LEVEL_FWHM = 6.0
 REACH_PX, N_ANGLES = 60, 32  # radius and number of rays of a source's symmetric model
 MIN_LIGHT = 0.5  # [sigma] where a source's own light ends
 UNSEEN = 1e30  # [sigma] value of unobserved pixels: the minimum is then that of the other side
@@ -114,6 +117,13 @@ def brightest_peak_near(rest, place, radius):
     window = rest[low[0] : place[0] + radius + 1, low[1] : place[1] + radius + 1]
     top = low + np.unravel_index(window.argmax(), window.shape)
     return parabolic_peak(rest, top), float(rest[tuple(top)])
+
+
+def local_level(rest, place, radius):
+    """Median [sigma], at least 0, of what is left within `radius` [px] of a peak."""
+    low = np.maximum(np.asarray(place) - radius, 0)
+    window = rest[low[0] : place[0] + radius + 1, low[1] : place[1] + radius + 1]
+    return max(float(np.median(window)), 0.0)
 
 
 def is_a_source(place, height, model, image, signals, centres, fwhm, scale):

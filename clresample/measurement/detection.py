@@ -28,10 +28,12 @@ from ..sky.observation import Observation, as_observations
 from ..sky.sources import ExtendedSource, PointSource, Source
 from .clumps import bodies_of
 from .companions import (
+    LEVEL_FWHM,
     MIN_PEAK_SIGMA,
     MIN_WIDE,
     brightest_peak_near,
     is_a_source,
+    local_level,
     parabolic_peak,
     residual_scatter,
     symmetric_residual,
@@ -314,9 +316,10 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     )
     rest, model = symmetric_residual(image, seen, centres)
     wide, _ = symmetric_residual(signals[sharp].flat(SMALL_GALAXY), seen, centres)
+    noise = residual_scatter(model)
     new = new_peaks(
         sep,
-        rest / residual_scatter(model),
+        rest / noise,
         max(threshold, MIN_PEAK_SIGMA),
         MIN_AREA_BESIDE * fwhm**2,
         list(places),
@@ -327,6 +330,9 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     for place, _ in new:
         at = place.astype(int)
         top, height = brightest_peak_near(rest, at, round(fwhm / 2))
+        height -= local_level(rest, at, round(LEVEL_FWHM * fwhm))
+        if height < MIN_PEAK_SIGMA * noise[tuple(at)]:
+            continue
         # two peaks on either side of a maximum are one source
         if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .clumps import Bodies, bodies_of
+from .clumps import Bodies, bodies_of, small_bodies_of
 from .peaks import new_peaks
 
 # [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
@@ -45,7 +45,9 @@ class Search:
 
     def sort_out(self, image, fwhm, scale):
         """Finds the bodies of the searched image and removes peaks that are their structure."""
-        self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold, scale)
+        given = fwhm, self.threshold, scale
+        self.bodies = bodies_of(image, np.array(self.positions), *given)
+        self._with_small_bodies(image, given)
         if not self.bodies.bodies:
             return
         places, peaks, labels = self.positions, self.peaks, self.labels
@@ -62,6 +64,20 @@ class Search:
             y, x = body.center.astype(int)
             self._put(body.center, float(image[y, x]), labels[0], i)
 
+    def _with_small_bodies(self, image, given):
+        """Adds the bodies of small galaxies among the peaks that belong to no body."""
+        large = self.bodies
+        centers = {tuple(body.center) for body in large.bodies}
+        free = [
+            i
+            for i, (place, owner) in enumerate(zip(self.positions, large.owners, strict=True))
+            if owner < 0 and not large.structure[i] and tuple(place) not in centers
+        ]
+        small = small_bodies_of(image, np.array(self.positions)[free], *given)
+        owners = large.owners.copy()
+        owners[free] = np.where(small.owners < 0, -1, small.owners + len(large.bodies))
+        self.bodies = Bodies((*large.bodies, *small.bodies), owners, large.structure)
+
     def add_companions(self, new, image, label):
         """Adds peaks beside others: positions and heights of an image's residual there."""
         for position, height in new:
@@ -72,6 +88,9 @@ class Search:
                 if is_clump:
                     continue
                 owner = owner if is_member else -1
+            else:
+                y, x = np.rint(position).astype(int)
+                owner = self.bodies.group_at(position, height, image[y, x] - height)
             self._put(position, height, label, owner)
 
     def in_order(self):

@@ -5,11 +5,13 @@ import pytest
 from scipy import ndimage
 
 from clresample.fields.blends.cut import FitLimits, cut_blend
+from clresample.fields.blends.cutouts import listed_source
 from clresample.fields.blends.link import link_footprints
 from clresample.fields.blends.plan import STEP_PX, FitPlan, make_fit_plan, source_ids
 from clresample.fields.blends.search import TileDetections, grown_footprints
 from clresample.fields.blends.tiles import tiles_of
 from clresample.sky.box import Box
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def test_cores_of_tiles_fill_the_region_once():
@@ -114,6 +116,18 @@ def test_every_source_is_in_one_patch_and_one_group_and_its_pixel_is_labelled():
     pieces = {n for g in plan.cut_groups for n in g}
     assert pieces == {p.number for p in plan.patches if p.pieces > 1}
     assert FitPlan.from_json(plan.to_json()).patches == plan.patches
+
+
+def test_stars_of_a_plan_are_points_in_its_fits():
+    plan, _ = plan_of(n=6, stars=np.arange(6) == 4)
+    plan = FitPlan.from_json(plan.to_json())
+    assert plan.stars == (int(plan.ids[4]),)
+    (patch,) = [p for p in plan.patches if 4 in p.sources]
+    star, galaxy = (listed_source(patch, plan, s, {int(plan.ids[s]): 2}) for s in (4, 3))
+    assert isinstance(star, PointSource) and star.free_position
+    assert isinstance(galaxy, ExtendedSource) and galaxy.n_components == 2
+    assert star.name == str(plan.ids[4])
+    np.testing.assert_allclose(star.position_px, plan.positions[4] - patch.box[:2])
 
 
 def test_ids_do_not_depend_on_the_run_and_say_where():

@@ -6,7 +6,7 @@ from helpers.blends import blend
 from scipy import ndimage
 
 from clresample.deblending.result import Component
-from clresample.measurement.clumps import bodies_of
+from clresample.measurement.clumps import bodies_of, small_bodies_of
 from clresample.measurement.columns import Columns
 from clresample.measurement.hills import saddles
 from clresample.measurement.photometry import group_fluxes, whole_groups
@@ -95,6 +95,20 @@ def test_two_disks_apart_are_two_bodies():
     found = judged(image, [(60, 30), (60, 90)])
     assert sorted(body.center[1] for body in found.bodies) == [30, 90]
     assert len(set(found.owners.tolist())) == 2
+
+
+def test_knots_of_a_small_galaxy_are_sources_in_its_group():
+    knot, twin, far = (60, 66), (60, 53), (60, 90)
+    image = disk(4) + point(knot, 100) + point(far, 200)
+    assert not judged(image, [MIDDLE, knot]).bodies
+    places = np.array([MIDDLE, knot, far])
+    found = small_bodies_of(image, places, FWHM, 5.0, 0.1)
+    assert found.owners.tolist() == [0, 0, -1] and not found.structure.any()
+    assert found.group_at(np.array(knot), 100, 75) == 0
+    assert found.group_at(np.array(knot), 1e5, 40) == found.group_at(np.array(far), 200, 1) == -1
+    image = image + disk(4, 380.0, twin)
+    twins = small_bodies_of(image, np.array([MIDDLE, twin]), FWHM, 5.0, 0.1)
+    assert sorted(twins.owners) == [-1, 0]  # a galaxy as bright is no part of the group
 
 
 def test_nothing_and_faint_light_have_no_body():

@@ -9,6 +9,7 @@ from clresample.measurement import companions, detection
 from clresample.measurement.companions import (
     brightest_peak_near,
     is_a_source,
+    local_level,
     parabolic_peak,
     residual_scatter,
     symmetric_residual,
@@ -31,6 +32,13 @@ def test_a_cone_is_all_of_one_source_and_its_light_ends_under_half_a_sigma():
     np.testing.assert_allclose(model[radius <= 8], image[radius <= 8], atol=0.15)
     assert not model[radius > 9].any() and model[20, 22 + 9] == pytest.approx(0.4, abs=1e-5)
     assert not symmetric_residual(0.05 * image, image > -1, np.array([[20.0, 22.0]]))[1].any()
+
+
+def test_the_level_of_a_residual_is_that_of_wings_and_not_of_a_peak():
+    rest = cone((41, 43), (20, 22), 9.0)
+    assert local_level(rest, (20, 22), 14) == 0
+    assert local_level(rest + 4, (20, 22), 14) == local_level(rest + 4, (3, 40), 14) == 4
+    assert local_level(rest - 4, (20, 22), 14) == 0
 
 
 def test_a_turned_ellipse_is_all_of_one_source():

@@ -11,7 +11,7 @@ from clresample.deblending.inspection.star_cores import star_cores
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.detection import detect
 from clresample.measurement.quality import summary
-from clresample.measurement.star_light import saturated_stars
+from clresample.measurement.star_light import StarPlace, _without_stars, saturated_stars
 from clresample.simulation.spoilers import saturate
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -90,6 +90,31 @@ def test_bad_columns_and_masked_galaxies_are_no_stars():
     data = clean.data[0] + galaxy
     cores = star_cores(np.where(weights > 0, data / NOISE, 0), weights > 0, clean.psf, 0)
     assert [np.hypot(*(core.place - STAR)) < 1 for core in cores] == [True]
+
+
+@pytest.mark.parametrize("width, height, n", [(2, 4, 1), (1, 9, 0), (2, 0, 0)])
+def test_a_bright_core_of_two_pixels_is_one_and_neither_a_column_nor_a_faint_one(width, height, n):
+    clean = starry(spikes=False, galaxy=False)
+    flux = FLUX if height else 40 * NOISE / moffat(0, 0)
+    y, x = np.indices(SHAPE)
+    light = flux * moffat(y - STAR[0], x - STAR[1]) / NOISE
+    usable = np.ones(SHAPE, bool)
+    usable[44 - height // 2 : 44 + max(height, 4) // 2, 47 : 47 + width] = False
+    cores = star_cores(np.where(usable, light, 0), usable, clean.psf, 0)
+    assert len(cores) == n
+    assert all(np.hypot(*(core.place - STAR)) < 0.3 for core in cores)
+
+
+def test_a_ray_that_alternates_has_no_peaks_and_a_source_on_it_stays():
+    y, x = np.indices((81, 81)) - 40.0
+    away = np.hypot(y, x)
+    image = 300 * np.exp(-away / 6) + np.random.default_rng(1).normal(0, 1, away.shape)
+    image[40] += np.where(away[40] % 2 < 1, 1, -1) * 200 * np.exp(-away[40] / 12)
+    image += 400 * np.exp(-((y - 20) ** 2 + x**2) / 4)
+    rest, own = _without_stars(image, image > -1e9, [StarPlace(np.array([40.0, 40.0]), 2.0)], 2.5)
+    assert own[40].all() and rest[60, 40] > 20
+    rest[56:65, 36:45] = 0
+    assert rest.max() < 5
 
 
 def test_flat_tops_that_nobody_masked_are_cores_too():

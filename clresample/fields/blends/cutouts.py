@@ -49,13 +49,16 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
         if seen is not None:
             observations.append(seen)
             boxes[mosaic.name] = box
-    sources = tuple(_source(patch, plan, s, known) for s in patch.sources)
+    sources = tuple(listed_source(patch, plan, s, known) for s in patch.sources)
     frame = model_frame(observations, grid=grid) if observations else None
     return Blend(tuple(observations), sources, frame), boxes
 
 
-def _source(patch, plan, s, components):
-    """The source s of a plan in the patch's pixels, a free PointSource if it is a star."""
+def listed_source(patch, plan, s, components):
+    """The source of index s of a plan in the patch's pixels, a free PointSource if it is a star.
+
+    components: {id: number of components} of galaxies
+    """
     number = int(plan.ids[s])
     place = tuple(map(float, plan.positions[s] - patch.box[:2]))
     if number in plan.stars:
