@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ..assessment.cores import core_errors, with_core_errors
-from ..assessment.edge import light_outside, widened
+from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.status import with_misfit_status
 from ..result import noted
 from .aligned_observation import align_observations
@@ -208,7 +208,9 @@ def with_errors(fit, result, peaks, seen):
     )
     fit.note_seconds("errors", time.perf_counter() - began)
     cores = core_errors(result, fit.settings.psf_error)
-    errors = with_core_errors(widened(errors, outside), cores)
+    wings = np.zeros_like(outside)
+    wings[fit.fitted] = start.wings * fit.unit
+    errors = with_core_errors(widened(with_common_error(errors, wings), outside), cores)
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
     exchanged = exchanged_light(result, start.source, fit.scene)
     errors = with_shared_light(errors, doubts, exchanged)

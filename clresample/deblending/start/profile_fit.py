@@ -5,11 +5,12 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
+from scipy.special import expit
 
 from ..spectra import MODEL_ERROR
 from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
-from .first_profiles import first_profiles
+from .first_profiles import WIDE_WINGS, first_profiles
 from .linearised_scenes import LinearisedScenes
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 
@@ -24,6 +25,11 @@ N_FIRST_STEPS = 5
 # (seeds 0 to 23, and blends of 20) is beyond 0.74 and 1.06; second starts that differed from first
 # ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
 MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
+# A scene is fitted once more from wide wings if these alone, with all else as fitted, raise chi2 by
+# less than this. Chi2 of faint galaxies with the prior has two minima, with and without wings, of
+# fluxes that differ by a third (bench.ladder, n = 4 at signal to noise 10 to 30); 5 and 20 give the
+# same results there.
+MAX_WINGS_LOSS = 20.0
 # Levenberg-Marquardt: damping of the first step relative to the normal matrix's diagonal, its
 # divisor after a successful step, its factor after a rejected one, and its largest value.
 FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
@@ -38,6 +44,8 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
+    wings (N, C): root mean square change of the spectra by the fit with other wings that did not
+        stay, if both were as probable before the data; 0 where there was none
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -51,7 +59,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness = np.zeros(len(shapes))
+        self.brightness, self.wings = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -73,6 +81,7 @@ class ProfileFit:
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
+        self._run_from_wings(np.flatnonzero(some))
 
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
@@ -109,6 +118,41 @@ class ProfileFit:
             self._step(scenes)
             self._take(scenes)
             self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
+
+    def _run_from_wings(self, scenes):
+        """Fits scenes again from wide wings if the data may have them; the better fit stays."""
+        before, theta = self._copy(), self.theta.copy()
+        compact = self.population.galaxies & (theta[..., 3] > np.log(WIDE_WINGS))
+        theta[compact, 3] = np.log(WIDE_WINGS)
+        scenes = scenes[compact[scenes].any(axis=1)]
+        if len(scenes):
+            self._look(scenes, theta, slopes=False)
+            self.looking.solve(MODEL_ERROR)
+            chi2 = self._chi2(scenes, theta)
+            near = chi2 < self.chi2[scenes] + MAX_WINGS_LOSS
+            self.looking.restore(before[2], scenes[~near])
+            scenes, chi2 = scenes[near], chi2[near]
+        if len(scenes):
+            self.theta[scenes], self.chi2[scenes] = theta[scenes], chi2
+            self._look(scenes, self.theta, slopes=True)
+            self.looking.compute_residuals(MODEL_ERROR)
+            self._take_equations(scenes)
+            self._step(scenes)
+            stays = before[0][scenes] <= self.chi2[scenes]
+            self._measure_wings(before, scenes, stays)
+            self._restore(before, scenes[stays])
+
+    def _measure_wings(self, before, scenes, stays):
+        """Stores `wings` of scenes from their present fits and those of a `_copy`.
+
+        stays (k,): scenes whose fit of the copy stays
+        """
+        penalty = [self.population.penalty(scenes, theta) for theta in (before[1], self.theta)]
+        loss = self.chi2[scenes] - penalty[1] - before[0][scenes] + penalty[0]
+        weight = np.zeros((len(self.theta), 1))
+        weight[scenes, 0] = expit(np.where(stays, -loss, loss) / 2)
+        change = self.looking.spectra - before[2][0]
+        self.wings = np.sqrt(weight)[self.looking.scene] * change
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""

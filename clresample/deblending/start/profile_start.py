@@ -64,6 +64,7 @@ class StartingPoint:
     peaks (n,): by which profiles of unit integral are divided, so that max = 1
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
+    wings (S, C): error of the sources' fluxes by wings that the data do not tell, see ProfileFit
     """
 
     source: np.ndarray
@@ -76,6 +77,7 @@ class StartingPoint:
     spectra: np.ndarray
     sky: np.ndarray
     spectrum_curvature: np.ndarray
+    wings: np.ndarray | float = 0.0
 
     def __len__(self):
         return len(self.shapes)
@@ -115,7 +117,12 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
-    return [_point(patch, looking, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
+    points = [
+        _point(patch, looking, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)
+    ]
+    for b, point in enumerate(points):
+        np.add.at(point.wings, point.source, fit.wings[looking.scene == b])
+    return points
 
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
@@ -166,6 +173,7 @@ def _point(patch, looking, thetas, sources, b, dark):
         spectra=looking.spectra[at] * peaks[:, None],
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
+        wings=np.zeros((len(patch.sources), looking.n_channels)),
     )
 
 
