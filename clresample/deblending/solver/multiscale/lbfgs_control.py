@@ -143,16 +143,19 @@ class LbfgsControl:
         """
         self._fresh |= which
         self._bare &= ~which
+        self._losses[which, 1:] = np.inf
         self._call_back(which)
 
     def resume(self, which):
-        """Prepares the scenes `which` (B,), converged or not, for a trial of an external step."""
+        """Prepares the scenes `which` (B,), converged or not, for a trial of an external step.
+
+        A scene that had converged does so again at once, unless the step lowers its loss.
+        """
         self._call_back(which)
         self._length[which], self._trials[which] = 1.0, 0
 
     def _call_back(self, which):
         """Continues the scenes `which` (B,), even if they had converged."""
-        self._losses[which, 1:] = np.inf
         self.converged &= ~which
         self.live |= which
 
