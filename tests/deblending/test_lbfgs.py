@@ -6,7 +6,6 @@ from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.buffers import SceneBuffers
 from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, _panels
-from clresample.deblending.solver.multiscale.scale_direction import ScaleDirection
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.lbfgs_steps import (
     AGAIN,
@@ -17,6 +16,7 @@ from clresample.deblending.solver.multiscale.lbfgs_steps import (
     LbfgsSteps,
 )
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.scale_direction import ScaleDirection
 from clresample.deblending.solver.multiscale.structure import LatentLayout
 from clresample.deblending.solver.multiscale.vectors import SolverVectors
 
