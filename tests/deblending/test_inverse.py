@@ -11,6 +11,7 @@ from clresample.deblending.solver.multiscale.evidence import (
 )
 from clresample.deblending.solver.multiscale.inverse import BlockPreconditioner, CurvatureBlock
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.scale_direction import ScaleDirection
 
 SPECTRUM = np.array([3.0, 1.0])
 
@@ -116,7 +117,8 @@ class Made:
         return np.repeat(self.strengths**-2.0, [a * b for a, b in self.sizes])[places]
 
     def blocks(self):
-        return self.made.blocks(self.strengths, SPECTRUM)
+        found = self.made.blocks(self.strengths, SPECTRUM)
+        return found[:-1] if found and isinstance(found[-1], ScaleDirection) else found
 
 
 def between(matrix, curvature):
@@ -194,6 +196,24 @@ def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
     for own in first:
         sides = np.ptp(np.divmod(own, made.sizes[0][1]), axis=1) + 1
         assert sides.prod() < 1.7 * len(own) + 10 and sides.max() < 3 * sides.min()
+
+
+def test_a_large_source_has_the_direction_that_only_the_prior_constrains(monkeypatch):
+    """Its curvature is 1, nearly all by the prior, where a change of equal |z / alpha| has a
+    thousand times as much. A source of one block has no such direction."""
+    strengths = np.array((0.3, 0.1, 0.05))
+    small = Made((17, 20), strengths).made.blocks(strengths, SPECTRUM)
+    assert not isinstance(small[-1], ScaleDirection)
+    monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", 150)
+    made = Made((26, 30), strengths)
+    d, curvature = made.made.blocks(strengths, SPECTRUM)[-1].values, made.curvature()
+    assert d @ curvature @ d == pytest.approx(1, rel=0.02)
+    by_prior = made.precision(slice(None)) * d @ d
+    assert 0.9 < by_prior <= 1
+    turned = np.roll(d, 1)
+    by_data = turned @ curvature @ turned - made.precision(slice(None)) * turned @ turned
+    print(by_prior, by_data)
+    assert by_data > 1000 * (1 - by_prior)
 
 
 def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():

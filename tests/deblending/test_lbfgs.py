@@ -16,6 +16,7 @@ from clresample.deblending.solver.multiscale.lbfgs_steps import (
     LbfgsSteps,
 )
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.scale_direction import ScaleDirection
 from clresample.deblending.solver.multiscale.structure import LatentLayout
 from clresample.deblending.solver.multiscale.vectors import SolverVectors
 
@@ -118,8 +119,10 @@ class Made:
         for s, some in enumerate(blocks):
             for level in range(2):
                 for block, matrix in some:
-                    where = self.latents.start[s] + block.indices
-                    if block.level == level:
+                    where = self.latents.start[s] + getattr(
+                        block, "indices", np.arange(len(matrix))
+                    )
+                    if getattr(block, "level", 1) == level:
                         before = out[where] if level else 0
                         out[where] = before + matrix @ vector[where]
         return out
@@ -127,7 +130,7 @@ class Made:
 
 def random_blocks(made, seed=5):
     """Blocks of two levels, and the matrices they stand for, of the first source that has
-    coefficients; of one level for the others."""
+    coefficients; of one level for the others. All have a direction."""
     rng, blocks = np.random.default_rng(seed), []
     for n in made.latents.shape.prod(2).sum(1):
         found = []
@@ -138,6 +141,9 @@ def random_blocks(made, seed=5):
             root = np.tril(rng.normal(size=(len(places), len(places)))).astype(np.float32)
             block = CurvatureBlock(int(level == 2), places, _panels(root))
             found.append((block, root.T.astype(float) @ root))
+        if found:
+            d = rng.normal(size=n).astype(np.float32)
+            found.append((ScaleDirection(d), np.outer(d, d.astype(float))))
         blocks.append(found)
     return blocks
 

@@ -104,7 +104,7 @@ class BlockPreconditioner:
         ]
         scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
         rows = np.column_stack([scale, np.concatenate(heard)])
-        steps = np.array(self._evidence.prior.steps)
+        steps, is_split = np.array(self._evidence.prior.steps), False
         for level in range(len(heard)):
             parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
             for own in parts:
@@ -113,8 +113,8 @@ class BlockPreconditioner:
                 yield CurvatureBlock(level, self._places(own), root)
             if len(parts) < 2:
                 break
-            rows = rows[rows[:, 0] > rows[:, 0].min()]
-        if level:
+            is_split, rows = True, rows[rows[:, 0] > rows[:, 0].min()]
+        if is_split:
             yield self._scale_direction(strengths, spectrum)
 
     def _scale_direction(self, strengths, spectrum):

@@ -168,5 +168,5 @@ class LbfgsSteps:
 
 
 def _has_direction(blocks):
-    """Whether the last of a source's blocks is a ScaleDirection."""
+    """Returns True if the last of a source's blocks is a ScaleDirection."""
     return bool(blocks) and isinstance(blocks[-1], ScaleDirection)

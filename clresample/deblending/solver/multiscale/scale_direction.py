@@ -1,4 +1,4 @@
-"""The change of a source's coefficients that scales its profile, which the data do not constrain.
+"""Change of a source's coefficients that scales its profile, constrained by the prior alone.
 
 S = p + u - p <p, u> / <p, p> does not change if u is proportional to p: the projection subtracts
 it. Such coefficients have the curvature of the prior alone, but blocks of a part of the box contain
