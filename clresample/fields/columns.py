@@ -51,8 +51,11 @@ def finalise_catalogue(job, parts, last, unsettled=()):
         at = np.stack([rows["y"], rows["x"]], axis=1)
         rows = rows.select_rows(job.core.contains(at))
         moving = np.isin(rows["parent_id"], np.array(sorted(unsettled), np.int64))
-        unsettled_reasons = [f"{reason}, which had not settled" for reason in rows["reason"]]
-        rows.put("reason", np.where(moving, np.array(unsettled_reasons, "U"), rows["reason"]))
+        reasons = [
+            f"{reason}, which had not settled" if one else reason
+            for one, reason in zip(moving, rows["reason"].tolist(), strict=True)
+        ]
+        rows.put("reason", np.array(reasons, "U"))
         table = rows.table()
     blends = Columns.concatenate(fits or [typed_rows([], PATCH_COLUMNS)])
     blends = blends.select_rows(np.argsort(blends["fit_id"])).table()
