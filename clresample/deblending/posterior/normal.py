@@ -2,8 +2,9 @@
 
 Each component's modes are rendered from its box in a window of the observation. Components with
 overlapping windows have a common block of the matrix. They are processed in the order of their
-rows, and images are dropped once no further window overlaps them: memory is proportional to the
-number of overlapping sources, not of all.
+rows,
+and images are dropped once no further window overlaps them: memory is proportional to the number of
+overlapping sources, not of all.
 """
 
 from __future__ import annotations
