@@ -178,8 +178,8 @@ def test_kernels_under_other_settings(setting):
         if setting == "two devices"
         else {"POCL_MAX_WORK_GROUP_SIZE": "64"}
     )
-    folders = [str(ROOT / "tests" / folder) for folder in ("device", "resampling")]
-    answer = run_python("-m", "pytest", "-q", "-x", "-m", "smoke", *folders, **environment)
+    rooms = [str(ROOT / "tests" / room) for room in ("device", "resampling")]
+    answer = run_python("-m", "pytest", "-q", "-x", "-m", "smoke", *rooms, **environment)
     assert answer.returncode == 0, answer.stdout
 
 
