@@ -183,7 +183,8 @@ def test_kernels_under_other_settings(setting):
     )
     files = [
         str(path)
-        for path in (ROOT / "tests" / "device").glob("test_*.py")
+        for folder in ("device", "resampling")
+        for path in (ROOT / "tests" / folder).glob("test_*.py")
         if MARK in path.read_text()
     ]
     answer = run_python("-m", "pytest", "-q", "-x", "-m", "smoke", *files, **environment)
