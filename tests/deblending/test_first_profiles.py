@@ -6,8 +6,7 @@ from helpers.scenes import blend
 
 from clresample import Settings
 from clresample.deblending.fit import Fit, start_fits
-from clresample.deblending.start import first_profiles as first_profiles_module
-from clresample.deblending.start import profile_fit
+from clresample.deblending.start import first_profiles as first_profiles_module, profile_fit
 from clresample.deblending.start.first_profiles import GROWTH, first_profiles
 
 GIANT = ((48.2, 47.6), (3e5, 2e5, 2.5e5), 14.0)
