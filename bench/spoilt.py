@@ -192,7 +192,7 @@ def summarise(rows, clean):
         "unspoilt": {
             "scenes": len(clean),
             "with a false warning": sum(map(bool, clean.values())),
-            **{f"times {n}": text for text, n in sorted(said.items(), key=lambda x: -x[1])},
+            **{text: f"times {n}" for text, n in sorted(said.items(), key=lambda x: -x[1])},
         },
     }
 

@@ -179,4 +179,23 @@ def _against_tractor(row, data):
         one = nearest(row["sources"], true["ra"], true["dec"])
         pull = (one["flux"] - flux) / np.hypot(one["flux_err"], error)
         figures[true["type"].strip()] = f"{one['flux'] / flux:.3f}, {pull:.1f}"
+    figures["both galaxies of DEV over its 7 arcsec aperture"] = _both_of_dev(row, table, to_ujy)
     return figures
+
+
+def _both_of_dev(row, table, to_ujy):
+    """Fluxes of the two galaxies of which the Tractor's DEV is one, over its aperture's light.
+
+    The Tractor lists two sources where the image has three, 15 px apart: its DEV of 6.4 arcsec is a
+    model of two of them (chi2 6030 for 4580 pixels, 4565 with three), and its flux of all light to
+    infinity follows from no pixels.
+    """
+    dev = table[[true["type"].strip() == "DEV" for true in table]][0]
+    away = [
+        np.hypot((s["ra"] - dev["ra"]) * np.cos(np.deg2rad(dev["dec"])), s["dec"] - dev["dec"])
+        for s in row["sources"]
+    ]
+    pair = [row["sources"][i] for i in np.argsort(away)[:2]]
+    flux, error = sum(s["flux"] for s in pair), np.hypot(*(s["flux_err"] for s in pair))
+    light = dev["decam_apflux"][Z][-1] * to_ujy
+    return f"{flux / light:.3f} +- {error / light:.3f}"

@@ -6,6 +6,7 @@ from helpers.scenes import MODEL_PSF, frame
 
 from clresample import ExtendedSource, Grid, Observation, deblend
 from clresample.deblending.profiles import profile, psf_second_moment
+from clresample.deblending.start import profile_fit
 from clresample.deblending.start.profile_fit import ProfileFit
 
 SHAPE, PLACE = (64, 64), (31.3, 32.1)
@@ -14,7 +15,7 @@ SHAPE, PLACE = (64, 64), (31.3, 32.1)
 @pytest.fixture
 def fitted(device, monkeypatch):
     """Fits a galaxy of these wings and signal to noise: beta at the end, wings' error, Result."""
-    kept, measure, run = {}, ProfileFit._measure_wings, ProfileFit.run
+    kept, measure, run = {}, profile_fit.wings_error, ProfileFit.run
 
     def noted(fit):
         run(fit)
@@ -28,8 +29,8 @@ def fitted(device, monkeypatch):
         image *= snr / np.linalg.norm(image)
         data = image + np.random.default_rng(3).normal(size=image.shape)
         seen = Observation(data, MODEL_PSF, Grid.flat(SHAPE, 0.1), weights=1.0, channels=["r"])
-        measuring = measure if measured else lambda *_: None
-        monkeypatch.setattr(ProfileFit, "_measure_wings", measuring)
+        measuring = measure if measured else lambda fit, *_: fit.wings
+        monkeypatch.setattr(profile_fit, "wings_error", measuring)
         sources = [ExtendedSource(position_px=PLACE)]
         found = deblend([seen], sources, frame=frame(SHAPE), device=device)
         return kept["beta"], kept["wings"], found

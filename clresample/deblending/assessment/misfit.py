@@ -117,11 +117,8 @@ def misfit_of(result) -> Misfit:
         worst.append(left.worst(n_sources))
         rest += [_of_channel(left, c, n_sources) for c in range(len(left.filtered))]
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
-    fields = [
-        np.concatenate(worst, axis=1),
-        *(rows[:-2] for rows in own),
-        _observed_flux(result, remainders),
-    ]
+    fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own)]
+    fields += [_observed_flux(result, remainders)]
     fields += [*(rows[-2:] for rows in own), *extended_light(result, remainders)]
     return Misfit(*fields)
 

@@ -81,7 +81,7 @@ class ProfileFit:
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
-        self._run_from_wings(np.flatnonzero(some))
+        _run_from_wings(self, np.flatnonzero(some))
 
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
@@ -118,41 +118,6 @@ class ProfileFit:
             self._step(scenes)
             self._take(scenes)
             self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
-
-    def _run_from_wings(self, scenes):
-        """Fits scenes again from wide wings if the data may have them; the better fit stays."""
-        before, theta = self._copy(), self.theta.copy()
-        compact = self.population.galaxies & (theta[..., 3] > np.log(WIDE_WINGS))
-        theta[compact, 3] = np.log(WIDE_WINGS)
-        scenes = scenes[compact[scenes].any(axis=1)]
-        if len(scenes):
-            self._look(scenes, theta, slopes=False)
-            self.looking.solve(MODEL_ERROR)
-            chi2 = self._chi2(scenes, theta)
-            near = chi2 < self.chi2[scenes] + MAX_WINGS_LOSS
-            self.looking.restore(before[2], scenes[~near])
-            scenes, chi2 = scenes[near], chi2[near]
-        if len(scenes):
-            self.theta[scenes], self.chi2[scenes] = theta[scenes], chi2
-            self._look(scenes, self.theta, slopes=True)
-            self.looking.compute_residuals(MODEL_ERROR)
-            self._take_equations(scenes)
-            self._step(scenes)
-            stays = before[0][scenes] <= self.chi2[scenes]
-            self._measure_wings(before, scenes, stays)
-            self._restore(before, scenes[stays])
-
-    def _measure_wings(self, before, scenes, stays):
-        """Stores `wings` of scenes from their present fits and those of a `_copy`.
-
-        stays (k,): scenes whose fit of the copy stays
-        """
-        penalty = [self.population.penalty(scenes, theta) for theta in (before[1], self.theta)]
-        loss = self.chi2[scenes] - penalty[1] - before[0][scenes] + penalty[0]
-        weight = np.zeros((len(self.theta), 1))
-        weight[scenes, 0] = expit(np.where(stays, -loss, loss) / 2)
-        change = self.looking.spectra - before[2][0]
-        self.wings = np.sqrt(weight)[self.looking.scene] * change
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
@@ -287,3 +252,44 @@ class ProfileFit:
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
+
+
+def _run_from_wings(fit, scenes):
+    """Fits scenes of a ProfileFit again from wide wings if the data may have them.
+
+    The better fit stays.
+    """
+    before, theta = fit._copy(), fit.theta.copy()
+    compact = fit.population.galaxies & (theta[..., 3] > np.log(WIDE_WINGS))
+    theta[compact, 3] = np.log(WIDE_WINGS)
+    scenes = scenes[compact[scenes].any(axis=1)]
+    if not len(scenes):
+        return
+    fit._look(scenes, theta, slopes=False)
+    fit.looking.solve(MODEL_ERROR)
+    chi2 = fit._chi2(scenes, theta)
+    near = chi2 < fit.chi2[scenes] + MAX_WINGS_LOSS
+    fit.looking.restore(before[2], scenes[~near])
+    scenes, chi2 = scenes[near], chi2[near]
+    if len(scenes):
+        fit.theta[scenes], fit.chi2[scenes] = theta[scenes], chi2
+        fit._look(scenes, fit.theta, slopes=True)
+        fit.looking.compute_residuals(MODEL_ERROR)
+        fit._take_equations(scenes)
+        fit._step(scenes)
+        stays = before[0][scenes] <= fit.chi2[scenes]
+        fit.wings = wings_error(fit, before, scenes, stays)
+        fit._restore(before, scenes[stays])
+
+
+def wings_error(fit, before, scenes, stays):
+    """The `wings` (N, C) of a ProfileFit that fitted scenes (k,) again from a `_copy`.
+
+    stays (k,): scenes whose fit of the copy stays
+    """
+    penalty = [fit.population.penalty(scenes, theta) for theta in (before[1], fit.theta)]
+    loss = fit.chi2[scenes] - penalty[1] - before[0][scenes] + penalty[0]
+    weight = np.zeros((len(fit.theta), 1))
+    weight[scenes, 0] = expit(np.where(stays, -loss, loss) / 2)
+    change = fit.looking.spectra - before[2][0]
+    return np.sqrt(weight)[fit.looking.scene] * change

@@ -173,7 +173,7 @@ def _point(patch, looking, thetas, sources, b, dark):
         spectra=looking.spectra[at] * peaks[:, None],
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
-        wings=np.zeros((len(patch.sources), looking.n_channels)),
+        wings=np.zeros((len(patch.sources), looking.spectra.shape[1])),
     )
 
 
