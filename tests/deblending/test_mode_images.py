@@ -55,7 +55,7 @@ def test_images_in_cells_are_arrays():
 
 @pytest.fixture(scope="module")
 def given(device):
-    """What the Posterior of a large galaxy with a small one on its flank is made of."""
+    """Parts of the Posterior of a large galaxy with a small one on its flank."""
     kept, make = [], Posterior.__init__
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Posterior, "__init__", lambda *a, **k: kept.append(a[1:]) or make(*a, **k))

@@ -27,7 +27,7 @@ def work(folder, task):
 
 
 def whose(folder, task):
-    """Which process has it."""
+    """Number of the process that has it."""
     return os.getpid()
 
 
@@ -52,7 +52,7 @@ class Itself:
 
 
 class Shared(Itself):
-    """What the tasks of a stage share; a process knows those that are there."""
+    """Context that the tasks of a stage share; a process holds those present."""
 
     there: ClassVar = weakref.WeakSet()
 
@@ -65,7 +65,7 @@ class Shared(Itself):
 
 
 def shared_there(shared, task):
-    """How many contexts of this and earlier stages the worker holds."""
+    """Number of contexts of this and earlier stages the worker holds."""
     return len(Shared.there)
 
 
