@@ -75,6 +75,7 @@ def test_no_fit_converges_before_it_has_looked():
     progress.loss_tol = float(CONVERGENCE_WINDOW)
     progress.settled[:] = True
     falls(progress, 0.9, 1.1)
+    progress._losses[:, CONVERGENCE_WINDOW + 1 :] += 100  # far larger falls before
     accepted = np.ones(2, bool)
     assert progress.significance_due(accepted).tolist() == [True, True]
     progress.next_actions(accepted)
