@@ -223,6 +223,17 @@ def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(before, now, en
     assert progress.converged.tolist() == [ends]
 
 
+def test_a_resumed_scene_converges_again_unless_the_step_gains():
+    """0.1 and 1 in one step, of which 0.5 are loss_tol; falls before were far larger, then none."""
+    progress = begun(10, 10)
+    progress.settled[:], progress.converged[:], progress.live[:] = True, True, False
+    progress._losses[:] = np.where(np.arange(progress._losses.shape[1]) > 5, 100, 10)
+    progress.resume(np.ones(2, bool))
+    assert progress.live.all() and not progress.converged.any()
+    judged(progress, [9.9, 9.0], [-1, -1])
+    assert progress.converged.tolist() == [True, False]
+
+
 def test_some_scenes_go_on_alone():
     progress = begun(10, 20, 30)
     progress.n_rounds[:] = [1, 2, 3]
