@@ -212,7 +212,6 @@ def test_a_large_source_has_the_direction_that_only_the_prior_constrains(monkeyp
     assert 0.9 < by_prior <= 1
     turned = np.roll(d, 1)
     by_data = turned @ curvature @ turned - made.precision(slice(None)) * turned @ turned
-    print(by_prior, by_data)
     assert by_data > 1000 * (1 - by_prior)
 
 

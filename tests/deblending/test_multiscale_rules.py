@@ -201,6 +201,18 @@ def test_scenes_update_strengths_when_due_though_others_do_not(due):
     assert learned == ([due] if any(due) else [])
 
 
+def test_a_resumed_scene_converges_again_unless_the_step_gains():
+    """0.1 and 1 in one step, of which 0.5 are loss_tol; falls before were far larger, then none."""
+    control = begun(10, 10)
+    control.converged[:], control.live[:] = True, False
+    control._losses[:] = np.where(np.arange(control._losses.shape[1]) > 5, 100, 10)
+    control.resume(np.ones(2, bool))
+    assert control.live.all() and not control.converged.any()
+    accepted, _ = control.accept_trials(np.array([9.9, 9.0]), -np.ones(2))
+    control.next_actions(accepted)
+    assert control.converged.tolist() == [True, False]
+
+
 def test_scales_have_steps_and_radii_of_their_sigmas():
     prior = MultiscalePrior(scales_px=(0.5, 1.0, 1.9, 2.0, 5.0, 8.0), strengths=(0.1,) * 6)
     assert prior.steps == (1, 1, 1, 2, 4, 8) and prior.radii == (2, 3, 6, 6, 15, 24)

@@ -40,8 +40,10 @@ LATE_LOOK, FALLING = 80, 50.0
 # falls over such windows continued as a geometric series. Falls below MIN_FALL of the tolerance do
 # not count. The tolerance scales with chi2 per pixel above 1, because flux errors grow as its
 # square root. Light of a small galaxy on a large one moves back from the large galaxy's structure
-# in iterations that gain little each: without the series such fits end with losses 8 too high and
-# fluxes 6 errors from the truth (bench.ladder, giant).
+# in iterations that gain little each: before sources had a ScaleDirection, the first criterion
+# alone ended such fits with losses 8 too high and fluxes 6 errors from the truth (bench.ladder,
+# giant). A criterion over the last twelfth of all iterations had an HSC blend do 285 rounds, the
+# series 248, with fluxes within 0.03 errors of those of 500 more (bench.real).
 CONVERGENCE_WINDOW, MIN_FALL = 5, 0.02
 
 
