@@ -131,7 +131,7 @@ def test_evidence_for_a_gradient_is_that_of_the_stack(images):
     for observations in ([*copies, red(images)], [stacked(images[0]), red(images)]):
         fit = Fit(Blend(tuple(observations), sources), settings, device, np.float64, pad=1)
         start_fits([fit])
-        iterate([fit], settings, device, np.float64)
+        iterate([fit], fit.settings, device, np.float64)
         found.append(run_gradient_tests([fit])[0])
     assert len(found[0].components)
     np.testing.assert_array_equal(found[0].components, found[1].components)
