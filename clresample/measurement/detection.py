@@ -330,8 +330,8 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     for place, _ in new:
         at = place.astype(int)
         top, height = brightest_peak_near(rest, at, round(fwhm / 2))
-        height -= local_level(rest, at, round(LEVEL_FWHM * fwhm))
-        if height < MIN_PEAK_SIGMA * noise[tuple(at)]:
+        level = local_level(rest, at, round(LEVEL_FWHM * fwhm))
+        if height - level < MIN_PEAK_SIGMA * noise[tuple(at)]:
             continue
         # two peaks on either side of a maximum are one source
         if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
