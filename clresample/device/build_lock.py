@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import threading
 import time
 from contextlib import contextmanager, suppress
 
@@ -20,6 +21,8 @@ MAX_WAIT_S = 30.0
 POLL_S = 0.005
 OFFSET_BITS = 62  # of a byte's place in a file
 
+_OPENING = threading.Lock()
+
 
 @contextmanager
 def build_lock(program):
@@ -33,13 +36,15 @@ def build_lock(program):
     """
     digest = hashlib.sha256(program.encode()).digest()
     place = int.from_bytes(digest[:8], "big") >> (64 - OFFSET_BITS)
-    file = _lock_file(cache_folder() / FILE)
+    with _OPENING:
+        file = _lock_file(cache_folder() / FILE)
     is_held = file is not None and _acquire(file, place)
     try:
         yield
     finally:
         if is_held:
-            fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+            with suppress(OSError):  # the file system has lost its locks
+                fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
 
 
 @functools.cache  # closing any file of the same name would free all locks of the process

@@ -2,7 +2,8 @@
 
 If CLRESAMPLE_PROFILE is set when a device is opened, every launch is timed. The table is printed on
 standard error when the process ends, or by the command at its end. Timing takes some microseconds
-a launch. For a field the table has the sums over all worker processes.
+a launch. Tables of worker processes, those of fields and of several devices, are added up by the
+device's name.
 """
 
 from __future__ import annotations

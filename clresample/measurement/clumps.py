@@ -74,9 +74,9 @@ POINT_AREA = 2.27
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A large galaxy's light.
+    """A galaxy's light, that of a large one or, in the second search, of a small one.
 
-    center (2,) [px]: (y, x); level [sigma]: of its highest isophote of BODY_AREA
+    center (2,) [px]: (y, x); level [sigma]: of its highest isophote of the least area
     light [sigma]: all of its light as the peak of a point source; outline: (slices, mask) of it
     clump [1]: contrast up to which peaks are its structure, 0 of a faint one
     """

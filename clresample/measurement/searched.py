@@ -60,9 +60,13 @@ class Search:
                 self.clumps.append(place)
             else:
                 self._put(place, peak, label, int(self.bodies.owners[i]))
+        own = {tuple(place): given for place, *given in zip(places, peaks, labels, strict=True)}
         for i, body in enumerate(self.bodies.bodies):
             y, x = body.center.astype(int)
-            self._put(body.center, float(image[y, x]), labels[0], i)
+            given = float(image[y, x]), labels[0]
+            if body.clump == 0:  # faint or small: its centre is one of the peaks
+                given = own.get(tuple(body.center), given)
+            self._put(body.center, *given, i)
 
     def _with_small_bodies(self, image, given):
         """Adds the bodies of small galaxies among the peaks that belong to no body."""

@@ -214,7 +214,9 @@ def _opened(rays, length):
 def _dips(rays, length):
     """Largest depth of rays (radii, angles) below their median within a length [px]."""
     light = np.where(np.isfinite(rays), rays, 0.0)
-    depth = median_filter(light, size=(length, 1), mode="nearest") - light
+    depth = np.where(
+        np.isfinite(rays), median_filter(light, size=(length, 1), mode="nearest") - light, 0.0
+    )
     return maximum_filter1d(depth, length, axis=0, mode="nearest")
 
 

@@ -180,7 +180,7 @@ def test_exposures_may_be_channels_of_one_observation(images):
     one = deblend([cube, red(images)], SOURCES)
     other = deblend([*exposures(images[0]), red(images)], SOURCES)
     flux, error = measured(other)
-    np.testing.assert_allclose((measured(one)[0] - flux) / error, 0, atol=1e-2)
+    np.testing.assert_allclose((measured(one)[0] - flux) / error, 0, atol=4e-2)
     np.testing.assert_allclose(measured(one)[1], error, rtol=3e-3)
 
 
@@ -250,7 +250,7 @@ def test_an_exposure_without_weight_changes_nothing(images):
     one = deblend([*exposures(images[0]), red(images)], SOURCES)
     other = deblend([*exposures(images[0]), dead, red(images)], SOURCES)
     flux, error = measured(one)
-    np.testing.assert_allclose((measured(other)[0] - flux) / error, 0, atol=1e-2)
+    np.testing.assert_allclose((measured(other)[0] - flux) / error, 0, atol=4e-2)
     np.testing.assert_allclose(measured(other)[1], error, rtol=3e-3)
 
 

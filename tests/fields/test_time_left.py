@@ -56,8 +56,10 @@ def test_a_late_long_task_counts_in_full_and_an_overdue_one_goes_on():
     predicted.end("b", 1, 0.0, 2.0)
     assert predicted.left(2.0) == pytest.approx(20)
     assert predicted.left(42.0) == pytest.approx(10)  # half of 20 s
-    predicted.end("half of long", 0, 2.0, 30.0)  # tried again in halves: no time per cost
-    assert predicted.pace == 2
+    predicted.split("long", {"one half": 5, "other half": 5})  # tried again
+    predicted.end("one half", 0, 30.0, 40.0)
+    predicted.end("other half", 0, 40.0, 50.0)
+    assert predicted.pace == 2 and predicted.left(50.0) == 0
 
 
 def test_an_earlier_run_gives_a_pace_from_the_start():

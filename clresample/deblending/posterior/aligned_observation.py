@@ -34,6 +34,9 @@ BAND = 1e-2
 # than its own by this factor, which halves their number at least. 99 % of the errors of fluxes and
 # moments of simulated scenes change by less than 0.2 %.
 MIN_REBIN_FACTOR = 1.2
+# Least sum of weights in a cell of several pixels, over the channel's largest: light in such a cell
+# counts 1e-5 of that in others.
+MIN_CELL_WEIGHT = 1e-10
 # Number of frequencies, over channels and images, that are computed at a time, so that they stay in
 # a core's second cache. All at once take a quarter more time.
 CACHED = 1 << 15
@@ -105,6 +108,9 @@ class AlignedObservation:
         power = cell_sums(np.square(self.sqrt_weights, dtype=np.float64), cell)
         y, x = (np.pad(at, (0, -len(at) % cell), mode="reflect", reflect_type="odd")
                 for at in (self.y, self.x))  # fmt: skip
+        # Values interpolated across a mask's edge leave some light in cells without weight, which
+        # products count once it has been divided by this root.
+        power = np.maximum(power, MIN_CELL_WEIGHT * power.max((1, 2), keepdims=True, initial=0))
         root = np.sqrt(power).astype(np.float32)
         return replace(self, y=y, x=x, sqrt_weights=root, cell=cell)
 

@@ -113,9 +113,9 @@ def from_cells(n, pixel):
 
 def interpolation(places, nodes):
     """Shares (n, m) of values at equidistant nodes (m,) in those at places (n,), by Lagrange."""
-    at, order = (places - nodes[0]) / (nodes[-1] - nodes[0]) * (len(nodes) - 1), min(4, len(nodes))
-    if order == 1:
+    if len(nodes) == 1:
         return np.ones((len(places), 1))
+    at, order = (places - nodes[0]) / (nodes[-1] - nodes[0]) * (len(nodes) - 1), min(4, len(nodes))
     first = np.clip(np.floor(at).astype(int) - order // 2 + 1, 0, len(nodes) - order)
     shares, rows = np.zeros((len(places), len(nodes))), np.arange(len(places))
     for k in range(order):

@@ -214,7 +214,10 @@ def with_errors(fit, result, peaks, seen):
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
     exchanged = exchanged_light(result, start.source, fit.scene)
     errors = with_shared_light(errors, doubts, exchanged)
-    draws = replace(draws, flux_changes=flux_changes(doubts, exchanged))
+    own = np.flatnonzero(wings.any(axis=1))  # each an independent change of one source's fluxes
+    changes = np.eye(len(wings))[:, None, own] * wings[:, :, None]
+    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged)
+    draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
 
 

@@ -150,10 +150,9 @@ class WorkerPool(Crew):
             worker.pipe.send((None, worker.task))
 
     def ended(self, job):
-        """Pairs (worker, Outcome) of tasks that have ended by now, after waiting for some."""
+        """Yields (worker, Outcome) of tasks that have ended by now, after waiting for some."""
         busy = self.busy
         ready = set(wait([one for w in busy for one in (w.pipe, w.process.sentinel)], POLL_S))
-        found = []
         for worker in busy:
             if worker.pipe in ready:
                 outcome = worker.answer()
@@ -165,8 +164,7 @@ class WorkerPool(Crew):
                 continue
             if outcome.cause is Cause.WORKER:
                 worker.end()
-            found.append((worker, outcome))
-        return found
+            yield worker, outcome
 
     def drop(self, worker, reason):
         """Removes a worker whose device is lost."""
@@ -189,19 +187,20 @@ class WorkerPool(Crew):
 
     def _start(self, worker):
         processes = multiprocessing.get_context("spawn")
-        worker.pipe, theirs = processes.Pipe()
+        ours, theirs = processes.Pipe()
         before = {name: os.environ.get(name) for name in self.environment}
         os.environ.update({k: v for k, v in self.environment.items() if before[k] is None})
         try:
-            worker.process = processes.Process(
+            process = processes.Process(
                 target=_work, args=(theirs, os.getpid(), *self._given), daemon=True
             )
-            worker.process.start()
+            process.start()
         finally:
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
         theirs.close()
+        worker.process, worker.pipe = process, ours
 
 
 def _work(pipe, parent, bound, setup, reason_of):

@@ -125,8 +125,8 @@ class FitPlan:
             tuple(map(tuple, about["groups"])),
             tuple(map(tuple, about["cut_groups"])),
             about["failed_tiles"],
-            about.get("hosts") and np.array(about["hosts"], np.int64),
-            tuple(about.get("stars", ())),
+            about["hosts"] and np.array(about["hosts"], np.int64),
+            tuple(about["stars"]),
         )
 
 

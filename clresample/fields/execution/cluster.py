@@ -72,6 +72,11 @@ class DaskCluster(Backend):
         """Each device, and the number of workers that share it: one."""
         return [(device, 1) for device in self.crew.devices or (None,)]
 
+    @property
+    def n_workers(self) -> int:
+        """Number of workers that the cluster has now."""
+        return len(self.client.scheduler_info()["workers"])
+
     def close(self):
         """Leaves the cluster as it is."""
         self.client.close()

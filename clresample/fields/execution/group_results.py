@@ -148,9 +148,9 @@ class GroupResultsFile:
             return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
 
     def offsets(self) -> np.ndarray:
-        """The rows of `GroupResults.offsets`; none of a part that an older version wrote."""
+        """The rows of `GroupResults.offsets`."""
         with open_fits(self.path) as hdus:
-            rows = _array(hdus["OFFSETS"]) if "OFFSETS" in hdus else np.zeros(0)
+            rows = _array(hdus["OFFSETS"])
         return np.zeros((0, 1)) if not rows.size else rows.astype(np.float64)
 
     def models(self, chosen=None, mosaic=None):

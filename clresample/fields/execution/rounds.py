@@ -228,15 +228,17 @@ def _fit_round(job, tasks, engine, progress):
         if len(group.patches) == 1:
             return None
         half = len(group.patches) // 2
-        return [
+        halves = [
             replace(group, name=f"{group.name}-{few[0]}", patches=few)
             for few in (group.patches[:half], group.patches[half:])
         ]
+        time_left.split(group.name, {half.name: _cost(job, half) for half in halves})
+        return halves
 
     costs = {group.name: _cost(job, group) for group in todo}
-    n_workers = sum(n for _, n in engine.device_shares)
-    alike = f"{read_search_setup(job.folder).devices}, {len(job.channels)} channels, {n_workers}"
-    time_left = TimeLeft(costs, n_workers, time.monotonic(), remembered_pace(alike))
+    devices = read_search_setup(job.folder).devices
+    alike = f"{devices}, {len(job.channels)} channels, {engine.n_workers}"
+    time_left = TimeLeft(costs, engine.n_workers, time.monotonic(), remembered_pace(alike))
     progress.time_left(time_left.left(time.monotonic()))
     for outcome in engine.run(FIT, job, todo, again=again, stage="fit"):
         group, value = outcome.task, outcome.value
@@ -248,7 +250,8 @@ def _fit_round(job, tasks, engine, progress):
             progress.message(f"{len(group.patches)} blends are set aside: {outcome.reason}")
         names[group.name] = group.patches
         progress.step(value["patches"], value["sources"])
-    if time_left.pace is not None and tasks[0].round == 0:  # pieces differ from whole blends
+    # pieces differ from whole blends, and a resumed run may have begun on another device
+    if time_left.pace is not None and tasks[0].round == 0 and not there:
         remember_pace(alike, time_left.pace)
     return names
 

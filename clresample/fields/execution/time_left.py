@@ -37,12 +37,17 @@ class TimeLeft:
         self._free: dict[int, float] = {}  # {worker: when its last task ended}
 
     def end(self, task, worker, start_s, end_s):
-        """Counts a task that has ended; unknown ones, such as halves, give no time per cost."""
+        """Counts a task that has ended; unknown ones give no time per cost."""
         cost = self.waiting.pop(task, None)
         if cost is not None:
             self._cost += cost
             self._seconds += end_s - start_s
         self._free[worker] = end_s
+
+    def split(self, task, costs):
+        """Replaces a task by others; costs {task: cost}: theirs, which begin before all waiting."""
+        self.waiting.pop(task, None)
+        self.waiting = costs | self.waiting
 
     @property
     def pace(self) -> float | None:

@@ -167,7 +167,8 @@ class LbfgsControl:
         enough = self.loss_tol * self.chi2()
         fall, both = self._fallen(CONVERGENCE_WINDOW), self._fallen(2 * CONVERGENCE_WINDOW)
         with np.errstate(invalid="ignore"):
-            ending = fall**2 < MAX_REMAINDER * enough * (both - 2 * fall)
+            slows = fall**2 < MAX_REMAINDER * enough * (both - 2 * fall)
+        ending = slows & np.isfinite(both)  # all losses of both windows are known
         calm = (fall < enough) & (ending | (fall < MIN_FALL * enough))
         self.converged |= accepted & self.settled & calm
         self.live &= ~self.converged
