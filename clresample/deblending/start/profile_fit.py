@@ -261,12 +261,12 @@ def _run_from_wings(fit, scenes):
 
     The better fit stays.
     """
-    before, theta = fit._copy(), fit.theta.copy()
-    compact = fit.population.galaxies & (theta[..., 3] > np.log(WIDE_WINGS))
-    theta[compact, 3] = np.log(WIDE_WINGS)
+    compact = fit.population.galaxies & (fit.theta[..., 3] > np.log(WIDE_WINGS))
     scenes = scenes[compact[scenes].any(axis=1)]
     if not len(scenes):
         return
+    before, theta = fit._copy(), fit.theta.copy()
+    theta[compact, 3] = np.log(WIDE_WINGS)
     fit._look(scenes, theta, slopes=False)
     fit.looking.solve(MODEL_ERROR)
     chi2 = fit._chi2(scenes, theta)

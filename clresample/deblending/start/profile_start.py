@@ -117,12 +117,7 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
-    points = [
-        _point(patch, looking, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)
-    ]
-    for b, point in enumerate(points):
-        np.add.at(point.wings, point.source, fit.wings[looking.scene == b])
-    return points
+    return [_point(patch, fit, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
 
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
@@ -151,8 +146,9 @@ def _solved_again(patch, point, fit_sky):
     )
 
 
-def _point(patch, looking, thetas, sources, b, dark):
-    """The StartingPoint of scene b from the solved least squares."""
+def _point(patch, fit, thetas, sources, b, dark):
+    """The StartingPoint of scene b from a ProfileFit, solved without errors of the models."""
+    looking = fit.looking
     at = np.flatnonzero(looking.scene == b)
     chosen, own, positions = [looking.components[i] for i in at], [], patch.positions.astype(float)
     peaks = np.zeros(len(at))
@@ -162,6 +158,8 @@ def _point(patch, looking, thetas, sources, b, dark):
         center = positions[sources[i]]
         peaks[k] = profile_peak(c.shape, thetas[i], c.position, center, c.frame)
     power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
+    wings = np.zeros((len(patch.sources), looking.spectra.shape[1]))
+    np.add.at(wings, sources[at], fit.wings[at])
     return StartingPoint(
         source=sources[at],
         positions=positions,
@@ -173,7 +171,7 @@ def _point(patch, looking, thetas, sources, b, dark):
         spectra=looking.spectra[at] * peaks[:, None],
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
-        wings=np.zeros((len(patch.sources), looking.spectra.shape[1])),
+        wings=wings,
     )
 
 
