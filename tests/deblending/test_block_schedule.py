@@ -46,33 +46,33 @@ def asked(schedule, sources, value, rounds):
 
 def test_blocks_count_a_fixed_number_of_their_scenes_rounds_later(schedule):
     made, delay = schedule.made, BLOCK_DELAY_ROUNDS
-    wanted = asked(made, [0, 2], 5, [7, 3])
-    assert not made.take(np.array([6 + delay, 2 + delay])) and made.blocks == [[], [], [], []]
+    (none, *_), wanted = made.blocks, asked(made, [0, 2], 5, [7, 3])
+    assert not made.take(np.array([6 + delay, 2 + delay])) and made.blocks == [none] * 4
     schedule.go.set()
     assert not made.take(np.array([6 + delay, 2 + delay]))  # not earlier, though they are there
-    assert made.take(np.array([6 + delay, 3 + delay])) and made.blocks == [[], [], wanted, []]
-    assert made.take(np.array([7 + delay, 3 + delay])) and made.blocks == [wanted, [], wanted, []]
+    assert made.take(np.array([6 + delay, 3 + delay])) and made.blocks == [none, none, wanted, none]
+    assert made.take(np.array([7 + delay, 3 + delay])) and made.blocks == [wanted, none, wanted, none]
     assert not made.take(np.array([70, 70]))
 
 
 def test_blocks_are_waited_for_where_they_are_named_or_asked_for_again(schedule):
     made = schedule.made
-    first = asked(made, [0, 3], 5, [7, 7])
+    (none, *_), first = made.blocks, asked(made, [0, 3], 5, [7, 7])
     schedule.go.set()
-    assert made.take(np.array([0, 0]), [3]) and made.blocks == [[], [], [], first]
+    assert made.take(np.array([0, 0]), [3]) and made.blocks == [none, none, none, first]
     second = asked(made, [0], 6, [7, 7])
-    assert made.blocks == [first, [], [], first]
+    assert made.blocks == [first, none, none, first]
     made.take(np.array([99, 99]))
     assert made.blocks[0] == second
 
 
 def test_what_goes_on_alone_takes_its_blocks_when_it_would_have(schedule):
-    wanted = asked(schedule.made, [0, 2, 3], 5, [7, 3])
+    (none, *_), wanted = schedule.made.blocks, asked(schedule.made, [0, 2, 3], 5, [7, 3])
     part = schedule.made.subset([3, 2], np.array([0, 0]))
     schedule.go.set()
     rounds = np.array([3 + BLOCK_DELAY_ROUNDS])
     assert not part.take(rounds - 1) and part.take(rounds)
-    assert part.blocks == [wanted, wanted] and schedule.made.blocks == [[], [], [], []]
+    assert part.blocks == [wanted, wanted] and schedule.made.blocks == [none] * 4
 
 
 def test_an_error_of_a_thread_is_raised_where_its_blocks_count(schedule):

@@ -11,7 +11,6 @@ from clresample.deblending.solver.multiscale.evidence import (
 )
 from clresample.deblending.solver.multiscale.inverse import BlockPreconditioner, CurvatureBlock
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
-from clresample.deblending.solver.multiscale.scale_direction import ScaleDirection
 
 SPECTRUM = np.array([3.0, 1.0])
 
@@ -35,9 +34,9 @@ def whole(block):
     root, at = np.zeros((-(-m // n_rows) * n_rows,) * 2), 0
     for i in range(0, len(root), n_rows):
         size = n_rows * (i + n_rows)
-        root[i : i + n_rows, : i + n_rows] = block.cholesky[at : at + size].reshape(n_rows, -1)
+        root[i : i + n_rows, : i + n_rows] = block.factor[at : at + size].reshape(n_rows, -1)
         at += size
-    assert at == block.cholesky.size and not np.triu(root, 1).any()
+    assert at == block.factor.size and not np.triu(root, 1).any()
     return root[:m, :m].T @ root[:m, :m]
 
 
@@ -117,8 +116,7 @@ class Made:
         return np.repeat(self.strengths**-2.0, [a * b for a, b in self.sizes])[places]
 
     def blocks(self):
-        found = self.made.blocks(self.strengths, SPECTRUM)
-        return found[:-1] if found and isinstance(found[-1], ScaleDirection) else found
+        return self.made.blocks(self.strengths, SPECTRUM).blocks
 
 
 def between(matrix, curvature):
@@ -203,10 +201,10 @@ def test_a_large_source_has_the_direction_that_only_the_prior_constrains(monkeyp
     thousand times as much. A source of one block has no such direction."""
     strengths = np.array((0.3, 0.1, 0.05))
     small = Made((17, 20), strengths).made.blocks(strengths, SPECTRUM)
-    assert not isinstance(small[-1], ScaleDirection)
+    assert small.direction is None and len(small.blocks) == 1
     monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", 150)
     made = Made((26, 30), strengths)
-    d, curvature = made.made.blocks(strengths, SPECTRUM)[-1].values, made.curvature()
+    d, curvature = made.made.blocks(strengths, SPECTRUM).direction.factor, made.curvature()
     assert d @ curvature @ d == pytest.approx(1, rel=0.02)
     by_prior = made.precision(slice(None)) * d @ d
     assert 0.9 < by_prior <= 1
@@ -228,7 +226,7 @@ def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():
 
 def test_coefficients_of_which_the_data_say_little_are_in_no_block():
     made = Made((17, 20), (1e-5, 1e-5, 1e-5))
-    assert made.blocks() == []
+    assert made.blocks() == ()
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
     places = np.concatenate([block.indices for block in made.blocks()])
     first = made.sizes[0][0] * made.sizes[0][1]
@@ -299,8 +297,8 @@ def test_blocks_stand_until_something_has_changed():
     made.strengths = made.strengths * [1.1, 1, 1]
     second = made.blocks()
     assert second is not first
-    assert made.made.blocks(made.strengths, SPECTRUM * [1.9, 1.5]) is second
-    assert made.made.blocks(made.strengths, SPECTRUM * [2.1, 1]) is not second
+    assert made.made.blocks(made.strengths, SPECTRUM * [1.9, 1.5]).blocks is second
+    assert made.made.blocks(made.strengths, SPECTRUM * [2.1, 1]).blocks is not second
 
 
 def test_a_curvature_that_is_no_sum_of_squares_leaves_its_diagonal():

@@ -5,7 +5,7 @@ import pytest
 from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.buffers import SceneBuffers
-from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, _panels
+from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, SourceBlocks, _panels
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.lbfgs_steps import (
     AGAIN,
@@ -148,12 +148,18 @@ def random_blocks(made, seed=5):
     return blocks
 
 
+def source_blocks(blocks):
+    """SourceBlocks of what `random_blocks` returned."""
+    parts = [[block for block, _ in some] for some in blocks]
+    return [SourceBlocks(tuple(some[:-1]), some[-1] if some else None) for some in parts]
+
+
 @every_type
 @pytest.mark.parametrize("with_blocks", [False, True])
 def test_inner_products_are_those_of_each_scene(build, dtype, with_blocks):
     m = Made(build, dtype)
-    blocks = random_blocks(m) if with_blocks else [[] for _ in m.b.host_boxes.scene]
-    m.steps.take_blocks([[block for block, _ in some] for some in blocks])
+    blocks = random_blocks(m) if with_blocks else [[]] * len(m.b.host_boxes)
+    m.steps.take_blocks(source_blocks(blocks))
     x, g, s, hy = (m.host[k] for k in ("x", "g", "s", "hy"))
     sums, slope, energy = m.steps.change()
     on = m.scene < 2
@@ -186,7 +192,7 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     a[1, 2:] = c[1, 2:] = 0
     scale, length = rng.uniform(0.5, 1, (2, 3))
     blocks = random_blocks(m)
-    m.steps.take_blocks([[block for block, _ in some] for some in blocks])
+    m.steps.take_blocks(source_blocks(blocks))
     m.steps.change()
     x, g, hg, d, s, hy = (m.get(k) for k in ("x", "g", "hg", "d", "s", "hy"))
     m.follow([mode, mode, REST])
@@ -211,7 +217,7 @@ def test_a_scene_that_is_no_number_harms_no_other(build, dtype):
     found = []
     for bad in (1.0, np.nan):
         m = Made(build, dtype)
-        m.steps.take_blocks([[block for block, _ in some] for some in random_blocks(m)])
+        m.steps.take_blocks(source_blocks(random_blocks(m)))
         build.upload(np.where(m.scene == 1, bad, m.host["g_new"]).astype(dtype), m.v.g_new)
         m.steps.change()
         m.follow([NEXT, NEXT, REST])
@@ -236,8 +242,8 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
         """The value of each block on the device, if it is the same all over."""
         flat, out = m.b.device.get(shelf.values), []
         for block in blocks:
-            part = flat[shelf.first(block) :][: block.cholesky.size]
-            np.testing.assert_array_equal(part, block.cholesky)
+            part = flat[shelf.first(block) :][: block.factor.size]
+            np.testing.assert_array_equal(part, block.factor)
             out.append(part[0])
         return out
 
@@ -247,7 +253,7 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
     blocks[3] = made(20)
     uploads.clear()
     shelf.retain(blocks)
-    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].cholesky.size
+    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].factor.size
     assert shelf.values is before and held() == [1, 2, 3, 20, 5, 6, 7, 8]
     assert [shelf.first(b) for b in blocks[4:]] == first[4:]
     blocks = [made(k + 30) for k in range(8)]

@@ -63,15 +63,19 @@ class ModeImages:
         return np.concatenate([smooth, self.sharp]).astype(dtype or smooth.dtype, copy=False)
 
 
-def cell_sums(images, pixel):
-    """Sums (..., my, mx) of images (..., ny, nx) over cells of `pixel` [px], see CellImages."""
+def cell_sums(values, pixel, *, n_axes=2, beyond="constant"):
+    """Sums (..., my, mx) of values (..., ny, nx) over cells of `pixel` [px], see CellImages.
+
+    n_axes: number of last axes that have cells; beyond: mode of np.pad past their ends, by default
+        zeros
+    """
     if pixel == 1:
-        return images
-    *many, n_y, n_x = images.shape
-    short = [(0, 0)] * len(many) + [(0, -n % pixel) for n in (n_y, n_x)]
-    cells = np.pad(images, short)
-    m_y, m_x = (n // pixel for n in cells.shape[-2:])
-    return cells.reshape(*many, m_y, pixel, m_x, pixel).sum((-3, -1))
+        return values
+    many, sides = values.shape[:-n_axes], values.shape[-n_axes:]
+    short = [(0, 0)] * len(many) + [(0, -n % pixel) for n in sides]
+    split = [side for n in sides for side in (-(-n // pixel), pixel)]
+    cells = np.pad(values, short, mode=beyond).reshape(*many, *split)
+    return cells.sum(tuple(range(-1, -2 * n_axes, -2)))
 
 
 def sums_with(modes, weights):

@@ -92,7 +92,10 @@ class SmoothModes:
         along = (variance[:, None] * scale)[:, :, None] * rows.blurred[:, low]
         across, amplitude = columns.blurred[:, high], np.sqrt(np.maximum(profile, 0))
         if self.pixel > 1:
-            along, across = (_cell_means(part, self.pixel) for part in (along, across))
+            along, across = (
+                cell_sums(part, self.pixel, n_axes=1, beyond="edge") / self.pixel
+                for part in (along, across)
+            )
             amplitude = cell_sums(amplitude, self.pixel) / self.pixel**2
         along, across, amplitude = map(_without_faint, (along, across, amplitude))
         self.images = along.transpose(1, 2, 0) @ across.transpose(1, 0, 2)
@@ -109,13 +112,6 @@ def whitening_transform(precision):
         return precision
     lower = np.linalg.cholesky(precision + MIN_SHARE * np.eye(len(precision)))
     return dtrtri(lower, lower=1)[0]
-
-
-def _cell_means(tables, pixel):
-    """Means (..., m) of tables (..., n) over each `pixel` values, their last one repeated."""
-    short = [(0, 0)] * (tables.ndim - 1) + [(0, -tables.shape[-1] % pixel)]
-    padded = np.pad(tables, short, mode="edge")
-    return padded.reshape(*tables.shape[:-1], -1, pixel).mean(-1)
 
 
 def _without_faint(table):

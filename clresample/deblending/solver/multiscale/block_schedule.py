@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ....device.multi_device import host_threads
+from .inverse import SourceBlocks
 
 # [rounds] of a scene between new strengths and the blocks that follow from them: a fixed number,
 # so that quick and slow threads give the same fit. With 0 the device waits for the threads.
@@ -17,14 +18,14 @@ class BlockSchedule:
     inverses (S): each source's BlockPreconditioner, None of fixed ones
     scene (S,): that of each source
 
-    blocks (S): of each source, see `BlockPreconditioner.blocks`; none of fixed ones
+    blocks (S): SourceBlocks of each source
     """
 
     def __init__(self, inverses, scene, device):
         self._inverses, self._scene = inverses, scene
         n_threads = host_threads(device)
         self._pool = ThreadPoolExecutor(n_threads) if n_threads > 1 else None
-        self.blocks = [[] for _ in inverses]
+        self.blocks = [SourceBlocks()] * len(inverses)
         self._waiting = {}  # source: round of its scene from which on its blocks count, Future
 
     def subset(self, sources, scene):

@@ -56,14 +56,27 @@ PANEL = 8
 class CurvatureBlock:
     """The inverse W^T W of a part of H, of m coefficients.
 
-    level: see `BlockPreconditioner.blocks`
+    level: see SourceBlocks
     indices (m,): of the coefficients among all of the source's, scale by scale
-    cholesky: W, lower triangular, in panels, see `_panels`
+    factor: W, lower triangular, in panels, see `_panels`
     """
 
     level: int
     indices: np.ndarray
-    cholesky: np.ndarray
+    factor: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SourceBlocks:
+    """The inverse curvature of one source; a fixed one has no blocks.
+
+    blocks: CurvatureBlocks. Those of one level have no coefficient in common; the results of levels
+        are added
+    direction: ScaleDirection of a source of several blocks at level 0; None for others
+    """
+
+    blocks: tuple[CurvatureBlock, ...] = ()
+    direction: ScaleDirection | None = None
 
 
 class BlockPreconditioner:
@@ -81,14 +94,10 @@ class BlockPreconditioner:
         self._at = self._blocks = None
 
     def blocks(self, strengths, spectrum):
-        """The CurvatureBlocks near strengths (J,) and a spectrum (C,).
-
-        Blocks of one level have no coefficient in common; the results of levels are added. The last
-        element is the ScaleDirection of a source of several blocks at level 0.
-        """
+        """The SourceBlocks near strengths (J,) and a spectrum (C,)."""
         if self._at is None or self._moved(strengths, spectrum):
             self._at = strengths.copy(), spectrum.copy()
-            self._blocks = list(self._made(*self._at))
+            self._blocks = self._made(*self._at)
         return self._blocks
 
     def _moved(self, strengths, spectrum):
@@ -97,25 +106,26 @@ class BlockPreconditioner:
         return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
 
     def _made(self, strengths, spectrum):
-        """Yields the blocks at these strengths and spectrum."""
+        """The SourceBlocks at these strengths and spectrum."""
         data = np.square(strengths) * self._evidence.curvature(spectrum)
         heard = [
             np.argwhere(part * light > MIN_DATA_TO_PRIOR) for part, light in zip(data, self._light)
         ]
         scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
         rows = np.column_stack([scale, np.concatenate(heard)])
-        steps, is_split = np.array(self._evidence.prior.steps), False
+        steps, found = np.array(self._evidence.prior.steps), []
         for level in range(len(heard)):
             parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
             for own in parts:
                 curvature = self._curvature(own, spectrum)
                 root = _root(curvature, strengths[own[:, 0]] ** -2)
-                yield CurvatureBlock(level, self._places(own), root)
+                found.append(CurvatureBlock(level, self._places(own), root))
             if len(parts) < 2:
                 break
-            is_split, rows = True, rows[rows[:, 0] > rows[:, 0].min()]
-        if is_split:
-            yield self._scale_direction(strengths, spectrum)
+            rows = rows[rows[:, 0] > rows[:, 0].min()]
+        is_split = sum(block.level == 0 for block in found) > 1
+        direction = self._scale_direction(strengths, spectrum) if is_split else None
+        return SourceBlocks(tuple(found), direction)
 
     def _scale_direction(self, strengths, spectrum):
         """The ScaleDirection (all coefficients,), of curvature 1 in the prior and data together."""

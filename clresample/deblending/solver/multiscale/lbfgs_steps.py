@@ -7,7 +7,6 @@ import numpy as np
 from ..boxes import ALIGN
 from .factor_store import FactorStore
 from .inverse import MAX_BLOCK_SIZE, PANEL
-from .scale_direction import ScaleDirection
 
 # What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
@@ -81,7 +80,7 @@ class LbfgsSteps:
             precision=v.precision,
             h=v.h,
         )
-        self._size, self._vector_size = (group, self._n_chunks), v.size
+        self._size = group, self._n_chunks
         self._reweigh_size = group, planes.shape[1], b.n_free
 
     def follow(self, pairs, mode):
@@ -130,21 +129,18 @@ class LbfgsSteps:
             self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
 
     def take_blocks(self, blocks):
-        """Sets the CurvatureBlocks and ScaleDirections of all sources (S)."""
+        """Sets the SourceBlocks of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
-        self._levels = []
-        self._set_directions(
-            {s: some[-1].values for s, some in enumerate(blocks) if _has_direction(some)}
-        )
-        blocks = [some[:-1] if _has_direction(some) else some for some in blocks]
-        self.shelf.retain([block for some in blocks for block in some])
-        listed = [(s, block) for s, some in enumerate(blocks) for block in some]
+        self._levels, self._directions = [], []
+        listed = [(s, block) for s, some in enumerate(blocks) for block in some.blocks]
+        whole = [(s, some.direction) for s, some in enumerate(blocks) if some.direction]
+        self.shelf.retain([block for _, block in listed + whole])
         for level in range(1 + max((block.level for _, block in listed), default=-1)):
             own = [(s, block) for s, block in listed if block.level == level]
             sizes = [len(block.indices) for _, block in own]
-            first = [self.shelf.first(block) // ALIGN for _, block in own]
-            table = [[scene[s] for s, _ in own], sizes, np.cumsum([0, *sizes[:-1]]), first]
+            table = [[scene[s] for s, _ in own], sizes, np.cumsum([0, *sizes[:-1]])]
+            table.append([self.shelf.first(block) // ALIGN for _, block in own])
             places = np.concatenate([start[s] + block.indices for s, block in own])
             given = {
                 "blocks": b.device.put(np.stack(table, axis=1), np.int32),
@@ -153,20 +149,9 @@ class LbfgsSteps:
                 "more": level > 0,
             }
             self._levels.append(((self._size[0], len(own)), given))
-
-    def _set_directions(self, directions):
-        """Uploads {source: direction (n,)}."""
-        b, start, scene = self._buffers, self._latents.start, self._buffers.host_boxes.scene
-        self._directions = []
-        if directions:
-            d = np.zeros(self._vector_size)
-            for s, values in directions.items():
-                d[start[s] : start[s] + len(values)] = values
-            ranges = [[scene[s], start[s], len(values)] for s, values in directions.items()]
-            given = {"ranges": b.device.put(np.array(ranges), np.int32), "d": b.put(d)}
-            self._directions.append(((self._size[0], len(ranges)), given))
-
-
-def _has_direction(blocks):
-    """Returns True if the last of a source's blocks is a ScaleDirection."""
-    return bool(blocks) and isinstance(blocks[-1], ScaleDirection)
+        if whole:
+            rows = [
+                [scene[s], start[s], d.factor.size, self.shelf.first(d) // ALIGN] for s, d in whole
+            ]
+            given = {"ranges": b.device.put(rows, np.int32), "factors": self.shelf.values}
+            self._directions.append(((self._size[0], len(rows)), given))

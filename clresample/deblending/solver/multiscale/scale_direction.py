@@ -24,9 +24,9 @@ N_STEPS, VARIANCE = 30, 1e-5
 
 @dataclass(frozen=True, eq=False)
 class ScaleDirection:
-    """The direction d of one source, scaled to d^T H d = 1: values (all its coefficients,)."""
+    """The direction d of one source, scaled to d^T H d = 1: factor (all its coefficients,)."""
 
-    values: np.ndarray
+    factor: np.ndarray
 
 
 def scale_coefficients(prior, profile, strengths):
