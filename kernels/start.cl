@@ -12,11 +12,11 @@
  *
  *   place    (slots, N_PLACE) int: scene, y0, x0, wy, wx, n, and the element of `images` where the
  *            slot's images begin: (n, n_bands, wy, wx), row by row
- *   root, data, light, residual, weight   (B, n_bands, my, mx): root of the weights, data times
- *            root, smoothed data times root
+ *   root, data, light, residual, weight   (B, n_bands, my, mx): root of the weights, data, smoothed
+ *            data times root
  *
  * whiten   images <- images root;  launch: (X, tallest window, slots)
- * compute_residuals  model m = sky root + sum_slots A images, residual r = data - m, weight w = 1 /
+ * compute_residuals  model m = sky root + sum_slots A images, residual r = data root - m, weight w = 1 /
  *          (1 + (error (light - sky root))^2) where root is not 0, error (B, n_bands);
  *          sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
@@ -117,7 +117,7 @@ void compute_residuals(__global const int *restrict scenes, __global const int *
             const int x = ROWS ? at + i : at + i * WG;
             if (x < mx) {
                 const REAL part = part_of_light * (bright[x] - level * r[x]);
-                const REAL rest = d[x] - m[x], weigh = 1 / (1 + part * part);
+                const REAL rest = d[x] * r[x] - m[x], weigh = 1 / (1 + part * part);
                 m[x] = rest;
                 w[x] = weigh;
                 chi2[i] += weigh * rest * rest;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -114,6 +115,11 @@ class WhitenedView:
         data = np.where(self.sqrt_weights > 0, self.data - level[:, None, None], 0.0)
         precision = (self.noise_unit / error) ** 2
         return replace(self, data=data, sky_level=level, sky_precision=precision)
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Weights (Co, My, Mx) [1 / unit^2]."""
+        return self.sqrt_weights**2
 
     @property
     def error_scale(self) -> np.ndarray:

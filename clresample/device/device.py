@@ -37,6 +37,7 @@ from .discovery import (
 from .errors import OUT_OF_MEMORY_STATUS, allocation_error, fork_error, status_of, to_device_error
 from .kernel_profiler import start_profiling
 from .program import Launcher, Programs
+from .resident import ResidentImages
 
 __all__ = ["Device", "get_device"]
 
@@ -53,6 +54,7 @@ class Device:
     compute_units: their number
     memory, max_alloc, in_use [bytes]: total, largest buffer, total of the arrays made here
     remembered: measurements of this device by earlier runs
+    resident: ResidentImages
     profile: times of all launches if CLRESAMPLE_PROFILE was set, else None
     """
 
@@ -65,6 +67,7 @@ class Device:
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
         self.in_use, self.remembered = 0, DeviceCache(cl_device)
+        self.resident = ResidentImages(self)
         _opened[self] = os.getpid()
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()

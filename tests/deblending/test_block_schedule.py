@@ -51,7 +51,12 @@ def test_blocks_count_a_fixed_number_of_their_scenes_rounds_later(schedule):
     schedule.go.set()
     assert not made.take(np.array([6 + delay, 2 + delay]))  # not earlier, though they are there
     assert made.take(np.array([6 + delay, 3 + delay])) and made.blocks == [none, none, wanted, none]
-    assert made.take(np.array([7 + delay, 3 + delay])) and made.blocks == [wanted, none, wanted, none]
+    assert made.take(np.array([7 + delay, 3 + delay])) and made.blocks == [
+        wanted,
+        none,
+        wanted,
+        none,
+    ]
     assert not made.take(np.array([70, 70]))
 
 

@@ -114,7 +114,7 @@ def test_chi2_is_that_where_a_components_light_is():
         light = spectra[:, part, None, None] ** 2 * whole * root**2
         wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
     scene = SimpleNamespace(channels=lambda: [slice(0, 1), slice(1, 3)])
-    seen = RenderedModel(spectra, sky, None, tuple(seen), ())
+    seen = RenderedModel(spectra, sky, *3 * [None], tuple(seen), ())
     found = _local_chi2(scene, views, seen, seen.residuals(scene.channels(), views))
     for a, b in zip(residuals, seen.residuals(scene.channels(), views), strict=True):
         np.testing.assert_allclose(a, b)

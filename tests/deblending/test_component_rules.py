@@ -11,6 +11,7 @@ from clresample.deblending.ended import Ended
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
+from clresample.deblending.start.final_render import RenderedModel
 from clresample.sky.sources import ExtendedSource, PointSource
 
 
@@ -81,6 +82,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
     spectra, sky = np.array([[3.0, 2.0, 1.0], [5.0, 1e-9, 4.0]]), np.array([0.5, -0.25, 0.125])
     low, parts, views, observed = np.array([[0, 0], [2, 3], [2, 3]]), [], [], []
     slope, power, chi2, light = np.zeros((3, 3)), np.zeros((3, 3)), 0.0, 0.0
+    normal, right = np.zeros((3, 4, 4)), np.zeros((3, 4))
     for part in (slice(0, 1), slice(1, 3)):
         parts.append(part)
         n = part.stop - part.start
@@ -92,6 +94,9 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         rest = noise * rng.normal(size=root.shape)
         views.append(SimpleNamespace(sqrt_weights=root, data=model + rest / root))
         whitened = whole * root
+        both = np.concatenate([whitened, root[None]])
+        normal[part] = np.einsum("icyx,jcyx->cij", both, both)
+        right[part] = np.einsum("icyx,cyx->ci", both, model * root + rest)
         slope[:, part] = np.einsum("icyx,cyx->ic", whitened, rest)
         power[:, part] = np.einsum("icyx,icyx->ic", whitened, whitened)
         own = spectra[1, part, None, None] ** 2 * whole[1] * root**2
@@ -103,7 +108,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         scene=SimpleNamespace(channels=lambda: parts),
         ties=None,
     )
-    seen = SimpleNamespace(observed=observed, covariance=covariance)
+    seen = RenderedModel(None, None, covariance, normal, right, tuple(observed), ())
     asked = colour_gradient._asked(fit, np.array([1]), seen)
     core = np.einsum("cj,jc->c", covariance[:, 2], slope)
     precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)

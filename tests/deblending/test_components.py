@@ -1,5 +1,6 @@
 """One component or two, by the data: the test of residuals, and what fits make of it."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,8 @@ from clresample.deblending.refit.colour_gradient import (
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
 from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.device.device import Device
+from clresample.device.resident import ResidentImages
 from clresample.measurement.catalogue import catalogue
 from clresample.paper.settings import PaperSettings
 from clresample.resampling.resampler import Resampler
@@ -193,6 +196,33 @@ def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):
     monkeypatch.setattr(LbfgsControl, "accept_trials", interrupted)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
     assert result.status == Ended.INTERRUPTED and counts(result) == [1, 1]
+
+
+def test_images_are_uploaded_once_for_all_fits_of_a_scene(device, monkeypatch):
+    """Data, weights and their roots, by the starts, both fits and the end, and for one start the
+    data without the other source's light; nothing stays."""
+    b, _ = blend()
+    deblend(b.observations, b.sources, frame=b.frame, device=device)
+    gc.collect()
+    before, uploads, images = device.in_use, [], []
+    upload, keep = Device.upload, ResidentImages._keep
+
+    def watched(self, values, array, **options):
+        uploads.append(values.tobytes())
+        return upload(self, values, array, **options)
+
+    def kept(self, image, dtype, *place):
+        images.append(image.astype(dtype).tobytes())
+        keep(self, image, dtype, *place)
+
+    monkeypatch.setattr(Device, "upload", watched)
+    monkeypatch.setattr(ResidentImages, "_keep", kept)
+    result = deblend(b.observations, b.sources, frame=b.frame, device=device)
+    assert counts(result) == [2, 1] and len(images) == 4 * len(b.observations)
+    for image in images:  # weights of 1 are their own roots
+        assert sum(image in values for values in uploads) == images.count(image)
+    gc.collect()
+    assert device.in_use == before
 
 
 def test_a_second_fit_that_fails_leaves_the_first(device, monkeypatch):

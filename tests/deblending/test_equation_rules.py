@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from clresample.deblending.spectra import RIDGE
-from clresample.deblending.start import linearised_scenes as module
+from clresample.deblending.start import equations, linearised_scenes as module
 from clresample.deblending.start.equations import normal_equations
 from clresample.deblending.start.linearised_scenes import LinearisedScenes
 
@@ -181,14 +181,17 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
     np.testing.assert_array_equal(one.sky[1], before[1][1])
 
 
-@pytest.mark.parametrize("size", [1.0, 1e-3])
+@pytest.mark.parametrize("size, portion", [(1.0, 1 << 25), (1e-3, 1 << 25), (1.0, 1)])
 @pytest.mark.parametrize("fit_sky", [False, True])
-def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky, size):
+def test_parameters_have_the_normal_equations_of_gauss_and_newton(
+    posed, fit_sky, size, portion, monkeypatch
+):
     """Changes by a step of the parameters after lit spectra and sky levels have followed it.
 
     Slopes that a component does not have are 0. Images of unit integral are far smaller than a
-    level of 1, whose curvature is no measure of theirs.
+    level of 1, whose curvature is no measure of theirs. Channels come together or one by one.
     """
+    monkeypatch.setattr(equations, "PORTION_BYTES", portion)
     one, rng, error = posed(fit_sky), np.random.default_rng(6), 0.1
     for sight in one.sights:
         sight.images *= size

@@ -65,6 +65,18 @@ def test_models_are_seen_side_by_side_each_with_its_own_spectra(
         np.testing.assert_allclose(seen.sky, level, atol=10 * close)
         scale = np.abs(covariance).max()
         np.testing.assert_allclose(seen.covariance, covariance, atol=10 * close * scale)
+        given, skies = 0.9 * spectra, np.split(0.5 * level, [len(model.views[0].data)])
+        parts = np.split(given, [len(skies[0])], 1)
+        left, power = [], []
+        for unit, v, level_here, a in zip(units, model.views, skies, parts, strict=True):
+            root, data = (x.reshape(len(v.data), -1) for x in (v.sqrt_weights, v.data))
+            rest = root * (data - level_here[:, None]) - np.einsum("ic,icp->cp", a, unit)
+            left.append(np.einsum("icp,cp->ic", unit, rest))
+            power.append(np.square(unit).sum(2))
+        left, power = np.concatenate(left, 1), np.concatenate(power, 1)
+        found_left = seen.residual_products(given, 0.5 * level)
+        np.testing.assert_allclose(found_left, left, atol=10 * close * np.abs(left).max())
+        np.testing.assert_allclose(seen.power, power, rtol=10 * close)
         for v, other, shown, taken in zip(
             model.views, model.unfiltered_views, seen.observed, seen.unfiltered_views, strict=True
         ):

@@ -32,7 +32,7 @@ def posed(monkeypatch, *, shares=False):
         SimpleNamespace(
             op=op,
             data=rng.random(op.shape_out),
-            sqrt_weights=rng.random(op.shape_out),
+            weights=rng.random(op.shape_out),
             coefficients=p,
         )
         for op, p in zip(ops, parts, strict=True)
@@ -68,7 +68,7 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
     assert scene.channels() == [slice(0, 1), slice(1, 3)]
     for k, view in enumerate(fit.views):
         assert scene.ops[k] is view.op and scene.data[k] is view.data
-        np.testing.assert_allclose(scene.weights[k], view.sqrt_weights**2)
+        np.testing.assert_allclose(scene.weights[k], view.weights)
         if shares:
             np.testing.assert_array_equal(scene.coefficients[k], view.coefficients[[1, 0, 0]])
         else:

@@ -104,7 +104,8 @@ def model_of(fit, which=()):
 def _asked(fit, which, seen):
     """Tests the rendered images of `model_of` for second components."""
     spectra, sky, n = fit.state.spectra, fit.state.sky, len(fit.state.morph)
-    slope, power = np.zeros((2, n + len(which), len(sky)))
+    alone = np.concatenate([spectra, np.zeros((len(which), len(sky)))])
+    slope, power = seen.residual_products(alone, sky), seen.power
     chi2, light, bare = np.zeros(len(which)), np.zeros(len(which)), []
     for view, rendered, part in zip(fit.views, seen.observed, fit.scene.channels(), strict=True):
         bare.append(
@@ -112,11 +113,6 @@ def _asked(fit, which, seen):
         )
         residual = view.sqrt_weights * (view.data - bare[-1].total(spectra[:, part]))
         residual -= view.sqrt_weights * sky[part, None, None]
-        for i, image in enumerate(rendered.images):
-            window = (slice(None), *rendered.window(i))
-            whitened = image * view.sqrt_weights[window]
-            slope[i, part] = (whitened * residual[window]).sum((1, 2))
-            power[i, part] = (whitened**2).sum((1, 2))
         for k, i in enumerate(which):
             window = (slice(None), *rendered.window(i))
             weight = (

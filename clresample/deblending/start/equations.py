@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..solver.rendering.ties import without_level
 from ..spectra import RIDGE
 
 # Largest number of parameters of a component; others are padded.
 N_PARAMETERS = 4
+# [bytes] Products of spectra and parameters that are made at a time, of one channel at least: those
+# of a scene of 1000 components take 32 MB a channel. Smaller portions take longer where there are
+# many small scenes.
+PORTION_BYTES = 1 << 25
 
 
 def normal_equations(looking):
@@ -16,83 +21,110 @@ def normal_equations(looking):
     Spectra and sky levels are eliminated. Call it after `render` with slopes and
     `compute_residuals`.
     """
-    k, n, rows = len(looking.scenes), looking.n_most, looking.rows
-    own, p = looking.index[looking.at], N_PARAMETERS
-    normal, right = np.zeros((k, n, p, n, p)), np.zeros((k, n, p))
-    inner = np.zeros((k, looking.n_channels, n + 1, n + 1))
-    cross = np.zeros((k, looking.n_channels, n + 1, n, p))
-    rest = np.zeros((k, looking.n_channels, n + 1))
-    known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
-    if looking.fit_sky:
-        rest[..., n], inner[..., n, n] = looking.of_level()
+    k, n, p, ties = len(looking.scenes), looking.n_most, N_PARAMETERS, looking.ties
+    normal, right, tied = np.zeros((k, n, p, n, p)), np.zeros((k, n, p)), None
+    portion = max(1, PORTION_BYTES // (k * (n + 1) * n * p * 8))
+    levels = looking.of_level() if looking.fit_sky else None
+    lit = looking.solution() > 0
     for sight, (table, on_device) in zip(looking.sights, looking.overlapping_pairs, strict=True):
-        c, channels = np.arange(looking.n_channels)[sight.channels][None], sight.channels
-        gram, pull = sight.gram(on_device, 1 + p), sight.residual_products(1 + p)
-        pairs = table[:, :2]
-        a = looking.spectra[looking.at][:, channels]
-        (i, j), b = own[pairs].T, rows[pairs[:, 0]]
-        one, other = pairs.T
-        mask = known[one][:, :, None] & known[other][:, None]
-        both = np.einsum("xc,xc,xckl->xkl", a[one], a[other], gram[..., 1:, 1:]) * mask
-        apart = one != other
+        products = ImageProducts(looking, sight, table, on_device, p)
+        products.add_parameters(normal, right)
+        for first in range(sight.channels.start, sight.channels.stop, portion):
+            channels = np.arange(first, min(first + portion, sight.channels.stop))
+            own = None if levels is None else [x[:, channels] for x in levels]
+            parts = products.with_spectra(channels - sight.channels.start, own)
+            if own is not None:
+                parts = _without_levels(normal, right, *parts)
+            parts = [*parts, lit[:, channels, :n]]
+            if ties is None:
+                _eliminate(normal, right, *parts)
+                continue
+            if tied is None:
+                tied = [np.zeros((k, ties.n_bands, *x.shape[2:])) for x in parts]
+            for total, x in zip(tied, parts, strict=True):
+                np.add.at(total, (slice(None), ties.band[channels]), x)
+    if tied is not None:
+        _eliminate(normal, right, *tied[:3], tied[3] > 0)
+    return normal.reshape(k, n * p, n * p), right.reshape(k, n * p)
+
+
+class ImageProducts:
+    """Products of the images of all components in one observation, a SlotObservation.
+
+    table, on_device: of its overlapping pairs; p: number of slopes of each profile
+    """
+
+    def __init__(self, looking, sight, table, on_device, p=0):
+        self._n, self._own, self._rows = looking.n_most, looking.index[looking.at], looking.rows
+        self._k, self._p = len(looking.scenes), p
+        self._gram, self._pull = sight.gram(on_device, 1 + p), sight.residual_products(1 + p)
+        self._one, self._other = table[:, :2].T
+        known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
+        a = looking.spectra[looking.at][:, sight.channels]
+        self._slopes = a[..., None] * known[:, None]  # by which those of a profile are multiplied
+
+    def add_parameters(self, normal, right):
+        """Adds the products of slopes to normal (k, n, p, n, p), with the residual to right."""
+        (i, j), b = self._own[[self._one, self._other]], self._rows[self._one]
+        given = self._slopes[self._one], self._slopes[self._other], self._gram[..., 1:, 1:]
+        both, apart = np.einsum("xck,xcl,xckl->xkl", *given), self._one != self._other
         normal[b, i, :, j] += both
         normal[b[apart], j[apart], :, i[apart]] += both[apart].swapaxes(1, 2)
-        at = b[:, None], c
-        inner[*at, i[:, None], j[:, None]] = inner[*at, j[:, None], i[:, None]] = gram[..., 0, 0]
-        of_other = a[other][..., None] * gram[..., 0, 1:] * known[other][:, None]
-        of_one = a[one][..., None] * gram[..., 1:, 0] * known[one][:, None]
-        cross[*at, i[:, None], j[:, None]] = of_other
-        cross[*at, j[:, None], i[:, None]] = of_one
-        slope = a[..., None, None] * pull[:, :, 1:] * known[:, None, :, None]
-        right[rows, own] += slope[..., 0].sum(axis=1)
-        at = rows[:, None], c
-        rest[*at, own[:, None]] = pull[:, :, 0, 0]
-        if looking.fit_sky:
-            inner[*at, own[:, None], n] = inner[*at, n, own[:, None]] = pull[:, :, 0, 1]
-            cross[*at, n, own[:, None]] = slope[..., 1]
-    lit = looking.solution() > 0
-    lit[..., n] = inner[..., n, n] > 0  # 0 in a channel without weights, or if it is not fitted
-    parts = normal, right, inner, cross, rest, lit
-    if looking.fit_sky or looking.ties is not None:
-        parts = _of_bands(looking.ties, *parts)
-    return _eliminated(*parts)
+        right[self._rows, self._own] += (self._slopes * self._pull[:, :, 1:, 0]).sum(axis=1)
+
+    def with_spectra(self, part, levels):
+        """Products of the spectra of some of the observation's channels, `part` (c,) or a slice.
+
+        With each other (k, c, n, n), with the parameters (k, c, n, n, p), with the residual
+        (k, c, n). If levels (k, c) are given, their right sides and curvatures, a level is the last
+        spectrum.
+        """
+        n, p, m = self._n, self._p, self._n + (levels is not None)
+        gram, pull, slopes = self._gram[:, part], self._pull[:, part], self._slopes[:, part]
+        size = self._k, gram.shape[1]
+        inner, cross = np.zeros((*size, m, m)), np.zeros((*size, m, n, p))
+        rest = np.zeros(inner.shape[:3])
+        (i, j), c = self._own[[self._one, self._other]][..., None], np.arange(size[1])
+        at = self._rows[self._one, None], c
+        inner[*at, i, j] = inner[*at, j, i] = gram[..., 0, 0]
+        cross[*at, i, j] = slopes[self._other] * gram[..., 0, 1:]
+        cross[*at, j, i] = slopes[self._one] * gram[..., 1:, 0]
+        at, own = (self._rows[:, None], c), self._own[:, None]
+        rest[*at, own] = pull[:, :, 0, 0]
+        if levels is not None:
+            rest[..., n], inner[..., n, n] = levels
+            inner[*at, own, n] = inner[*at, n, own] = pull[:, :, 0, 1]
+            cross[*at, n, own] = slopes * pull[:, :, 1:, 1]
+        return inner, cross, rest
 
 
-def _of_bands(ties, normal, right, inner, cross, rest, lit):
-    """Arguments of `_eliminated`, with the sky levels eliminated and tied channels summed.
+def _without_levels(normal, right, inner, cross, rest):
+    """The last three without the levels, the last spectra, which are eliminated from all.
 
-    `inner`, `cross`, `rest` and `lit` then have n spectra and, with Ties, B bands in place of C
-    channels. A level has thousands of times the curvature of a spectrum: a ridge relative to that
-    would hold the spectra.
+    A level has thousands of times the curvature of a spectrum: a ridge relative to that would hold
+    the spectra. The arguments are as in `_eliminate`; normal and right are changed.
     """
-    n = rest.shape[-1] - 1
-    level = np.divide(1, inner[..., n, n], where=lit[..., n], out=np.zeros(lit.shape[:-1]))
-    side, by_level = inner[..., :n, n] * level[..., None], cross[..., n, :, :]
-    normal = normal - np.einsum("kcip,kcjq,kc->kipjq", by_level, by_level, level)
-    right = right - np.einsum("kcip,kc->kip", by_level, level * rest[..., n])
-    gram = inner[..., :n, :n] - side[..., None] * inner[..., n, None, :n]
-    cross = cross[..., :n, :, :] - side[..., None, None] * by_level[..., None, :, :]
-    rest = rest[..., :n] - side * rest[..., n, None]
-    if ties is None:
-        return normal, right, gram, cross, rest, lit[..., :n]
-    of_bands = (ties.total(a, axis=1) for a in (gram, cross, rest, lit[..., :n]))
-    gram, cross, rest, lit = of_bands
-    return normal, right, gram, cross, rest, lit > 0
+    gram, pull, share, value = without_level(inner, rest)
+    k, c, m, n, p = cross.shape
+    by_level, curvature = cross[:, :, -1].reshape(k, c, n * p), inner[..., -1:, -1]
+    over = np.divide(by_level, curvature, where=curvature > 0, out=np.zeros_like(by_level))
+    normal -= (by_level.swapaxes(1, 2) @ over).reshape(normal.shape)
+    right -= np.einsum("kcip,kc->kip", cross[:, :, -1], value)
+    return gram, cross[:, :, :-1] - share[..., None, None] * cross[:, :, -1:], pull
 
 
-def _eliminated(normal, right, inner, cross, rest, lit):
-    """Normal matrices (k, P, P) and right sides (k, P) of parameters without the spectra.
+def _eliminate(normal, right, inner, cross, rest, lit):
+    """Eliminates the spectra from the equations of the parameters, which are changed.
 
     normal (k, n, p, n, p), right (k, n, p): of the parameters; inner (k, C, m, m), rest (k, C, m):
     of the spectra, of which those `lit` (k, C, m) are free; cross (k, C, m, n, p): of both
     """
     k, n_channels, m, n, p = cross.shape
-    normal, right = normal.reshape(k, n * p, n * p), right.reshape(k, n * p)
     cross, rest = cross.reshape(k, n_channels, m, n * p) * lit[..., None], rest * lit
     inner = inner * lit[..., None] * lit[..., None, :]
     ridge = RIDGE * np.trace(inner, axis1=2, axis2=3)[..., None] + ~lit
     inner += ridge[..., None] * np.eye(m)
     solved = np.linalg.solve(inner, cross)
     for c in range(n_channels):
-        normal = normal - cross[:, c].swapaxes(1, 2) @ solved[:, c]
-    return normal, right - np.einsum("kcmp,kcm->kp", solved, rest)
+        normal -= (cross[:, c].swapaxes(1, 2) @ solved[:, c]).reshape(normal.shape)
+    right -= np.einsum("kcmp,kcm->kp", solved, rest).reshape(right.shape)

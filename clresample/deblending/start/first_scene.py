@@ -22,7 +22,7 @@ def first_scene(fit) -> tuple[Scene, State]:
         unpadded_shape=fit.frame.shape,
         ops=[v.op for v in fit.views],
         data=[v.data for v in fit.views],
-        weights=[v.sqrt_weights**2 for v in fit.views],
+        weights=[v.weights for v in fit.views],
         origin=np.array([low for low, *_ in boxes]),
         center=np.array([center for _, _, center, _ in boxes]),
         profile=morphs,

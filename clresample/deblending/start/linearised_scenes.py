@@ -8,6 +8,7 @@ from ...device.tuning import Tuning
 from ..solver.rendering.ties import band_equations
 from ..spectra import nnls_batch, spectrum_covariance
 from .component_batch import ComponentBatch, boxes_of, profile_thresholds
+from .equations import ImageProducts
 from .slot_observation import SlotObservation
 
 
@@ -125,27 +126,16 @@ class LinearisedScenes:
         then of a level of 1, with each other and with the data
         """
         self.compute_residuals(error)
-        n, rows = self.n_most, self.rows
-        normal = np.zeros((len(self.scenes), self.n_channels, n + 1, n + 1))
-        right = np.zeros(normal.shape[:3])
-        own = self.index[self.at]
-        right[..., n], normal[..., n, n] = self.of_level()
-        for sight, (table, pairs) in zip(self.sights, self.overlapping_pairs, strict=True):
-            channels = np.arange(self.n_channels)[sight.channels]
-            gram, pull = sight.gram(pairs, 1)[..., 0, 0], sight.residual_products(1)[:, :, 0]
-            (i, j), c = own[table[:, :2]].T[:, :, None], channels[None]
-            b = rows[table[:, 0], None]
-            normal[b, c, i, j] = normal[b, c, j, i] = gram
-            right[rows[:, None], c, own[:, None]] = pull[..., 0]
-            normal[rows[:, None], c, own[:, None], n] = pull[..., 1]
-            normal[rows[:, None], c, n, own[:, None]] = pull[..., 1]
-        solution = self.solution()
-        right += np.einsum("kcij,kcj->kci", normal, solution)
-        self.normal, self.right = normal, right
+        parts, levels = [], self.of_level()
+        for sight, pairs in zip(self.sights, self.overlapping_pairs, strict=True):
+            own = [x[:, sight.channels] for x in levels]
+            parts.append(ImageProducts(self, sight, *pairs).with_spectra(slice(None), own)[::2])
+        self.normal, right = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+        self.right = right + np.einsum("kcij,kcj->kci", self.normal, self.solution())
         found = self._non_negative()
-        self.spectra[self.at] = found[rows, :, own]
+        self.spectra[self.at] = found[self.rows, :, self.index[self.at]]
         if self.fit_sky:
-            self.sky[self.scenes] = found[..., n]
+            self.sky[self.scenes] = found[..., self.n_most]
 
     def with_components(self, components) -> LinearisedScenes:
         """The same observations with other components."""

@@ -28,7 +28,7 @@ class SlotObservation:
     n_elements: of the last rendered slots; n_pixels: of all products so far
     ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
     sky_precision (B, Co): the views', 0 where they have none
-    root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
+    root (B, Co, My, Mx): on the device, as are data, residual and weight
     """
 
     def __init__(self, views, channels, device, dtype, tuning, precision: Precision, tolerance):
@@ -36,8 +36,8 @@ class SlotObservation:
         self.tuning = tuning
         shape = self.n_bands, self.my, self.mx = views[0].sqrt_weights.shape
         shape = len(views), *shape
-        self.root = device.put(np.array([v.sqrt_weights for v in views]), dtype)
-        self.data = device.put(np.array([v.data * v.sqrt_weights for v in views]), dtype)
+        self.root = device.resident.stack([v.sqrt_weights for v in views], dtype)
+        self.data = device.resident.stack([v.data for v in views], dtype)
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
         self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
@@ -189,9 +189,10 @@ def smoothed_light(view):
 
     Pixels without weight are ignored, and get no light.
     """
-    seen = gaussian_filter(view.sqrt_weights**2, (0, LIGHT_PX, LIGHT_PX), mode="constant")
-    light = gaussian_filter(
-        view.sqrt_weights**2 * view.data, (0, LIGHT_PX, LIGHT_PX), mode="constant"
+    sigma = 0, LIGHT_PX, LIGHT_PX
+    seen, light = (
+        gaussian_filter(part, sigma, mode="constant")
+        for part in (view.weights, view.weights * view.data)
     )
     return view.sqrt_weights * np.divide(
         light, seen, out=np.zeros_like(light), where=view.sqrt_weights > 0

@@ -33,7 +33,7 @@ class OperatorResponse:
         """Computed at first use: a batch whose strengths have settled does not need it."""
         b, found = self.buffers, []
         for i, o in enumerate(self._observations):
-            weights = b.put(np.stack([s.weights[i] for s in b.scenes]))
+            weights = b.device.resident.stack([s.weights[i] for s in b.scenes], b.dtype)
             found.append(o.op.adjoint(weights))
         return found
 

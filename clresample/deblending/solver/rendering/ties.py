@@ -80,11 +80,19 @@ def band_equations(ties, normal, right, fit_sky):
     returns normal (..., B, n, n), right (..., B, n), and the levels' own: their coupling to the
         spectra (..., C, n) and right sides (..., C), both divided by their curvature
     """
-    n = right.shape[-1] - 1
-    level, side = normal[..., n, n], normal[..., :n, n]
+    gram, pull, own, value = without_level(normal, right, fit_sky)
+    return ties.total(gram, axis=-3), ties.total(pull, axis=-2), own, value
+
+
+def without_level(normal, right, fit_sky=True):
+    """Normal equations of spectra in each channel, its sky level eliminated.
+
+    Arguments and results are those of `band_equations`, with C channels in place of bands. A level
+    of no curvature is 0.
+    """
+    level, side = normal[..., -1, -1], normal[..., :-1, -1]
     free = (level > 0) & bool(fit_sky)
     over = np.divide(1, level, where=free, out=np.zeros_like(level))
-    own, value = side * over[..., None], right[..., n] * over
-    gram = normal[..., :n, :n] - own[..., None] * side[..., None, :]
-    pull = right[..., :n] - side * value[..., None]
-    return ties.total(gram, axis=-3), ties.total(pull, axis=-2), own, value
+    own, value = side * over[..., None], right[..., -1] * over
+    gram = normal[..., :-1, :-1] - own[..., None] * side[..., None, :]
+    return gram, right[..., :-1] - side * value[..., None], own, value
