@@ -22,7 +22,7 @@
  *             launch: (WG, my, B * n_bands), groups of (WG, 1, 1), which share a row
  * square      image <- image^2;  launch: (X, my, B * n_bands)
  * gather_morph    d_boxed_s[y, x] (+)= sum_c spectra[s, channel + c] frame[b, c, y0 + y, x0 + x]
- *             for the sources listed in `active`; launch: (X, tallest box, len(active))
+ *             for the sources listed in `active`; launch: (X, any, len(active))
  * gather_spectra  dA[s, channel + c] = sum_yx boxed_s[y, x] frame[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`
  *             launch: (WG, n_bands, len(active)), groups of (WG, 1, 1)

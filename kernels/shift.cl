@@ -163,6 +163,7 @@ __kernel void scatter_pixels(const int n_items, const int n_i, const int n_cols,
                      const int step_l, const int step_i)
 {
     const int j = (int)get_global_id(0), l = (int)get_global_id(1);
+    if (j >= ld) return;
     const int b = j / n_cols, i = j % n_cols;
     const size_t p = (size_t)l * step_l + (size_t)i * step_i;
     REAL value = 0;

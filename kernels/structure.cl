@@ -8,12 +8,11 @@
  * after scale from LATENTS on in the solver's vectors.  A step of at most sigma loses nothing: at
  * the coarse grid's Nyquist frequency the kernel has at most 0.7 % of its amplitude.
  *
- * coefficients_to_image     u = amp o sum_j K_j z;  launch: (X, tallest box, n_free)
+ * coefficients_to_image     u = amp o sum_j K_j z;  launch: (X, Y, n_free)
  * form_morphology       S from u, the gauge with it;  launch: (WG, n_free), groups (WG, 1)
  * morphology_adjoint  q = amp o (v - b <b, v> / <b, b>), v = dS where S > 0, over dS;  launch: as
  *     for form_morphology
- * image_to_coefficients  g = K_j^T q + precision[s, j] z for every scale;  launch: (X, COARSE rows,
- *     n_free)
+ * image_to_coefficients  g = K_j^T q + precision[s, j] z for every scale;  launch: (X, Y, n_free)
  * coefficient_norms  out[s, j] = sum z_sj^2 of the sources listed;      launch: (WG, n_scales,
  *     n_free)
  *
@@ -22,8 +21,8 @@
  *            kernel: a row of one pass, with MARGIN zeros before it, and as many and 16 more behind
  * MARGIN     a multiple of ALIGN, the largest of RADII and of STEPS together at least
  * start      (S, 2) int: of LATENTS and LINES, in units of ALIGN elements
- * table, flat buffers: see boxes.h.  X is 1 where a work-item walks a whole row (ROWS), else the
- * widest row: there each pixel is one sum over two axes, and `line` is not used.
+ * table, flat buffers: see boxes.h.  X is 1 where a work-item walks a whole row (ROWS), else any
+ * number, as Y is: there each pixel is one sum over two axes, and `line` is not used.
  */
 #include "common.h"
 #include "boxes.h"
@@ -110,58 +109,60 @@ __kernel void coefficients_to_image(__global const int *restrict active,
                      __global const REAL *restrict z, __global const REAL *restrict amp,
                      __global REAL *restrict line, __global REAL *restrict u)
 {
-    const int s = active[get_global_id(2)], y = (int)get_global_id(1);
+    const int s = active[get_global_id(2)];
     HEAD(s)
-    if (y >= ny) return;
-    __global const REAL *plane = z + LATENTS(s);
-    __global REAL *out = u + box + (size_t)y * nx;
+    FOR_Y(y, ny) {
+        __global const REAL *plane = z + LATENTS(s);
+        __global REAL *out = u + box + (size_t)y * nx;
 #if ROWS
-    __global REAL *row = line + LINES(s) + (size_t)y * LINE(nx) + MARGIN;
-    for (int j = 0; j < N_SCALES; ++j) {
-        const int step = steps[j], radius = radii[j];
-        const int cy = COARSE(ny, step), cx = COARSE(nx, step);
-        const int low = y - radius > 0 ? (y - radius + step - 1) / step : 0;
-        const int top = (y + radius) / step, high = top < cy - 1 ? top : cy - 1;
-        __global const REAL *k = taps + (size_t)j * TAPS;
-        /* coefficients on the pixels that they belong to, zeros between them */
-        for (int m = 0; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
-        sum_rows(plane + (size_t)low * cx, high - low + 1, cx, k + y + radius - step * low, -step,
-                 cx, row, step);
-        int x = 0;
-        for (; x + 16 <= nx; x += 16) {
-            SIXTEEN sum;
-            smoothed(row + x, k, radius, &sum);
-            if (j) sum += AT(const SIXTEEN, out + x);
-            AT(SIXTEEN, out + x) = sum;
+        __global REAL *row = line + LINES(s) + (size_t)y * LINE(nx) + MARGIN;
+        for (int j = 0; j < N_SCALES; ++j) {
+            const int step = steps[j], radius = radii[j];
+            const int cy = COARSE(ny, step), cx = COARSE(nx, step);
+            const int low = y - radius > 0 ? (y - radius + step - 1) / step : 0;
+            const int top = (y + radius) / step, high = top < cy - 1 ? top : cy - 1;
+            __global const REAL *k = taps + (size_t)j * TAPS;
+            /* coefficients on the pixels that they belong to, zeros between them */
+            for (int m = 0; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
+            sum_rows(plane + (size_t)low * cx, high - low + 1, cx, k + y + radius - step * low,
+                     -step, cx, row, step);
+            int x = 0;
+            for (; x + 16 <= nx; x += 16) {
+                SIXTEEN sum;
+                smoothed(row + x, k, radius, &sum);
+                if (j) sum += AT(const SIXTEEN, out + x);
+                AT(SIXTEEN, out + x) = sum;
+            }
+            if (x < nx) {
+                SIXTEEN sum;
+                smoothed(row + x, k, radius, &sum);
+                for (int l = 0; x + l < nx; ++l) out[x + l] = (j ? out[x + l] : (REAL)0) + sum[l];
+            }
+            plane += (size_t)cy * cx;
         }
-        if (x < nx) {
-            SIXTEEN sum;
-            smoothed(row + x, k, radius, &sum);
-            for (int l = 0; x + l < nx; ++l) out[x + l] = (j ? out[x + l] : (REAL)0) + sum[l];
-        }
-        plane += (size_t)cy * cx;
-    }
-    for (int x = 0; x < nx; ++x) out[x] *= amp[box + (size_t)y * nx + x];
+        for (int x = 0; x < nx; ++x) out[x] *= amp[box + (size_t)y * nx + x];
 #else
-    const int x = (int)get_global_id(0);
-    if (x >= nx) return;
-    REAL total = 0;
-    for (int j = 0; j < N_SCALES; ++j) {
-        const int step = steps[j], radius = radii[j];
-        const int cy = COARSE(ny, step), cx = COARSE(nx, step);
-        __global const REAL *k = taps + (size_t)j * TAPS + radius;
-        const int c0 = x - radius > 0 ? (x - radius + step - 1) / step : 0;
-        for (int r = y - radius > 0 ? (y - radius + step - 1) / step : 0;
-             r < cy && step * r <= y + radius; ++r) {
-            REAL sum = 0;
-            for (int c = c0; c < cx && step * c <= x + radius; ++c)
-                sum += k[x - step * c] * plane[(size_t)r * cx + c];
-            total += k[y - step * r] * sum;
+        FOR_X(x, nx) {
+            __global const REAL *own = plane;
+            REAL total = 0;
+            for (int j = 0; j < N_SCALES; ++j) {
+                const int step = steps[j], radius = radii[j];
+                const int cy = COARSE(ny, step), cx = COARSE(nx, step);
+                __global const REAL *k = taps + (size_t)j * TAPS + radius;
+                const int c0 = x - radius > 0 ? (x - radius + step - 1) / step : 0;
+                for (int r = y - radius > 0 ? (y - radius + step - 1) / step : 0;
+                     r < cy && step * r <= y + radius; ++r) {
+                    REAL sum = 0;
+                    for (int c = c0; c < cx && step * c <= x + radius; ++c)
+                        sum += k[x - step * c] * own[(size_t)r * cx + c];
+                    total += k[y - step * r] * sum;
+                }
+                own += (size_t)cy * cx;
+            }
+            out[x] = amp[box + (size_t)y * nx + x] * total;
         }
-        plane += (size_t)cy * cx;
-    }
-    out[x] = amp[box + (size_t)y * nx + x] * total;
 #endif
+    }
 }
 
 /* sum_i VALUE over i < n by all work-items of a group, each of which gets it. Where a work-item has
@@ -235,56 +236,59 @@ __kernel void image_to_coefficients(__global const int *restrict active,
 {
     const int s = active[get_global_id(2)];
     HEAD(s)
-    size_t plane = LATENTS(s);
-    int r = (int)get_global_id(1), j = 0, step = steps[0];
-    int cy = COARSE(ny, step), cx = COARSE(nx, step);
-    while (r >= cy) {
-        r -= cy;
-        plane += (size_t)cy * cx;
-        if (++j == N_SCALES) return;
-        step = steps[j];
-        cy = COARSE(ny, step);
-        cx = COARSE(nx, step);
-    }
-    const int radius = radii[j], middle = step * r;
-    const int low = middle > radius ? middle - radius : 0;
-    const int high = middle + radius < ny - 1 ? middle + radius : ny - 1;
-    __global const REAL *k = taps + (size_t)j * TAPS;
-    __global const REAL *in = q + box;
-    const size_t at = plane + (size_t)r * cx;
-    const REAL weight = precision[s * N_SCALES + j];
+    int n_rows = 0;
+    for (int i = 0; i < N_SCALES; ++i) n_rows += COARSE(ny, steps[i]);
+    FOR_Y(of_all, n_rows) {
+        size_t plane = LATENTS(s);
+        int r = of_all, j = 0, step = steps[0];
+        int cy = COARSE(ny, step), cx = COARSE(nx, step);
+        while (r >= cy) {
+            r -= cy;
+            plane += (size_t)cy * cx;
+            step = steps[++j];
+            cy = COARSE(ny, step);
+            cx = COARSE(nx, step);
+        }
+        const int radius = radii[j], middle = step * r;
+        const int low = middle > radius ? middle - radius : 0;
+        const int high = middle + radius < ny - 1 ? middle + radius : ny - 1;
+        __global const REAL *k = taps + (size_t)j * TAPS;
+        __global const REAL *in = q + box;
+        const size_t at = plane + (size_t)r * cx;
+        const REAL weight = precision[s * N_SCALES + j];
 #if ROWS
-    __global REAL *row =
-        line + LINES(s) + (size_t)get_global_id(1) * LINE(nx) + MARGIN;
-    sum_rows(in + (size_t)low * nx, high - low + 1, nx, k + low - middle + radius, 1, nx, row, 1);
-    for (int m = nx; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
-    /* at all pixels, of which a coefficient belongs to every `step`-th */
-    for (int x = 0; x <= step * (cx - 1); x += step > 16 ? step : 16) {
-        SIXTEEN sum;
-        smoothed(row + x, k, radius, &sum);
-        if (step == 1 && x + 16 <= cx) {
-            const SIXTEEN own = AT(const SIXTEEN, z + at + x);
-            AT(SIXTEEN, gradient + at + x) = sum + weight * own;
-        } else
-            for (int l = 0; l < 16 && x + l <= step * (cx - 1); l += step) {
-                const size_t c = at + (x + l) / step;
-                gradient[c] = sum[l] + weight * z[c];
-            }
-    }
+        __global REAL *row = line + LINES(s) + (size_t)of_all * LINE(nx) + MARGIN;
+        sum_rows(in + (size_t)low * nx, high - low + 1, nx, k + low - middle + radius, 1, nx, row,
+                 1);
+        for (int m = nx; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
+        /* at all pixels, of which a coefficient belongs to every `step`-th */
+        for (int x = 0; x <= step * (cx - 1); x += step > 16 ? step : 16) {
+            SIXTEEN sum;
+            smoothed(row + x, k, radius, &sum);
+            if (step == 1 && x + 16 <= cx) {
+                const SIXTEEN own = AT(const SIXTEEN, z + at + x);
+                AT(SIXTEEN, gradient + at + x) = sum + weight * own;
+            } else
+                for (int l = 0; l < 16 && x + l <= step * (cx - 1); l += step) {
+                    const size_t c = at + (x + l) / step;
+                    gradient[c] = sum[l] + weight * z[c];
+                }
+        }
 #else
-    const int c = (int)get_global_id(0);
-    if (c >= cx) return;
-    const int left = step * c > radius ? step * c - radius : 0;
-    const int right = step * c + radius < nx - 1 ? step * c + radius : nx - 1;
-    REAL total = 0;
-    for (int y = low; y <= high; ++y) {
-        REAL sum = 0;
-        for (int x = left; x <= right; ++x)
-            sum += k[x - step * c + radius] * in[(size_t)y * nx + x];
-        total += k[y - middle + radius] * sum;
-    }
-    gradient[at + c] = total + weight * z[at + c];
+        FOR_X(c, cx) {
+            const int left = step * c > radius ? step * c - radius : 0;
+            const int right = step * c + radius < nx - 1 ? step * c + radius : nx - 1;
+            REAL total = 0;
+            for (int y = low; y <= high; ++y) {
+                REAL sum = 0;
+                for (int x = left; x <= right; ++x)
+                    sum += k[x - step * c + radius] * in[(size_t)y * nx + x];
+                total += k[y - middle + radius] * sum;
+            }
+            gradient[at + c] = total + weight * z[at + c];
+        }
 #endif
+    }
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

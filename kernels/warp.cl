@@ -13,7 +13,7 @@
  *            them, (1, n_lines, batch / n_bands).
  *
  * rowdot   y[b, p] = sum_x<n T[b, p, x] * E[p, x]        launch: (n_positions rounded up, batch)
- * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, batch)
+ * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, rounded up, batch)
  *          The two ends of the executor for any positions: each observed pixel p has a table row
  *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero from n on, of which
@@ -120,6 +120,7 @@ __kernel void rowscale(const int n_positions, const int n_pad, const int n_bands
     /* pixels along the first axis: GPUs take at most 65,535 groups along the others */
     const size_t i = get_global_id(0), p = i / n_pad, x = i % n_pad;
     const int b = (int)get_global_id(1);
+    if (p >= n_positions) return;
     const size_t i_table = n_tables > 1 ? b / n_bands : 0;
     T[((size_t)b * n_positions + p) * n_pad + x] =
         y[y_offset + (size_t)b * n_positions + p] * E[(i_table * n_positions + p) * n_pad + x];

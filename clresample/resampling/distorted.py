@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..device.contraction import COLUMN_PAD, ImageBatch
+from ..device.contraction import ImageBatch
 from .executor import Executor
 
 
@@ -35,7 +35,7 @@ class DistortedExecutor(Executor):
         out_y_t = self.cached("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
         product = self.product(**self.adjoint_options())
         self.from_rows = self.to_frequencies(product, self.n_rows, out_y_t, half)
-        self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
+        self.rowscale = self._rows("rowscale", (self.tuning.line_group, 1), half)
 
     def _rows(self, name, local_size, half):
         """A kernel over the pixels' rows of tables."""
@@ -55,5 +55,5 @@ class DistortedExecutor(Executor):
 
     def pixels_to_frequencies(self, y: ImageBatch, n):
         """Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x];  y (n, P): I2"""
-        self.rowscale((self.k_pad * self.n_rows, n), y=y.buffer, y_offset=y.offset)
+        self.rowscale((self.whole_groups(self.k_pad * self.n_rows), n), y=y.buffer, y_offset=y.offset)
         self.from_rows(n)

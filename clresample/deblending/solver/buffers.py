@@ -111,6 +111,15 @@ class SceneBuffers:
         tallest, widest = self.host_boxes.shape.max(0)
         return self.sized(widest, tallest, n_boxes)
 
+    def strided_rows(self, shapes, n_boxes):
+        """A launch over the rows of `n_boxes` boxes of some `shapes` (S, 2), see FOR_Y.
+
+        It has the work-items of boxes of the mean shape: with those of the largest box nine in ten
+        would have no work where a few boxes are large.
+        """
+        n_y, n_x = np.ceil(np.mean(shapes, axis=0)).astype(int).tolist()
+        return self.sized(n_x, n_y, n_boxes)
+
     def items(self, n):
         """A launch for `n` items, several a work-item on CPUs; see FOR_I of work_group.h."""
         if self.tuning.row_loops:

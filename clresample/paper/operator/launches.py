@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...device.contraction import COLUMN_PAD, BoundContraction, MatrixBatch
+from ...device.contraction import BoundContraction, MatrixBatch
 from ...device.tuning import Tuning
 
 
@@ -90,14 +90,12 @@ class PixelLaunches:
         self.n_cols = n_cols
         self.covered = device.put(mapping.covered.astype(np.uint8))
         group = Tuning.of(device, dtype).line_group
+        self._group = group
         self.launchers = [
             functools.partial(
                 device.launcher, "shift.cl", name, dtype=dtype, local_size=local_size, LANES=lanes
             )
-            for name, local_size in (
-                ("sum_chunks", (group, 1, 1)),
-                ("scatter_pixels", (COLUMN_PAD, 1)),
-            )
+            for name, local_size in (("sum_chunks", (group, 1, 1)), ("scatter_pixels", (group, 1)))
         ]
 
     def bind(self, part, n_chunks, ld, n):
@@ -113,5 +111,5 @@ class PixelLaunches:
             functools.partial(
                 collect.bind(n_chunks=n_chunks, n_i=self.n_i), (self.n_i, self.n_l, n)
             ),
-            functools.partial(spread.bind(n_items=n, n_i=self.n_i), (ld, self.n_l)),
+            functools.partial(spread.bind(n_items=n, n_i=self.n_i), (-(-ld // self._group) * self._group, self.n_l)),
         )

@@ -124,8 +124,9 @@ class StructureOperator:
         self._energy = launcher(
             "structure.cl", "coefficient_norms", 3, local_size=(group, 1, 1), **macros
         ).bind(**placed, out=self.energies)
-        self._rows_size = b.box_rows(b.n_free)
-        self._coarse_size = b.sized(b.host_boxes.shape[:, 1].max(), rows.max(), b.n_free)
+        self._rows_size = b.strided_rows(b.host_boxes.shape, b.n_free)
+        coarse = np.column_stack([rows, b.host_boxes.shape[:, 1]])
+        self._coarse_size = b.strided_rows(coarse, b.n_free)
         self._sources_size = group, b.n_free
         self._energy_size = group, self.n_scales, b.n_free
 

@@ -57,8 +57,7 @@ class SpectralComposition:
             launcher("gather_morph"),
             launcher("gather_spectra", (group, 1, 1)),
         )
-        tallest, widest = boxes.shape.max(0).tolist()
-        self._morph_size = b.sized(widest, tallest, 1)[:2]
+        self._morph_size = b.strided_rows(boxes.shape, 1)[:2]
         self._spectra.bind(active=b.all_sources)
         self._spectra_size = group, n_bands, b.all_sources.size
 
