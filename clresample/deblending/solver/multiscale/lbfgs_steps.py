@@ -24,7 +24,7 @@ class LbfgsSteps:
         v, n_slots = vectors, vectors.n_slots
         b, self._latents = v.buffers, v.latents
         self._buffers = b
-        self._n_slots, self._n_chunks = n_slots, len(v.chunks)
+        self._n_slots, self._n_chunks, self._sizes = n_slots, len(v.chunks), v.parts()
         self._first_chunks = np.flatnonzero(np.diff(v.chunks[:, 0], prepend=-1))
         n = len(b.scenes)
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
@@ -81,7 +81,7 @@ class LbfgsSteps:
             precision=v.precision,
             h=v.h,
         )
-        self._size, self._vector_size = (group, self._n_chunks), v.size
+        self._size = group, self._n_chunks
         self._reweigh_size = group, planes.shape[1], b.n_free
 
     def follow(self, pairs, mode):
@@ -129,14 +129,27 @@ class LbfgsSteps:
         if b.n_free:
             self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
 
-    def take_blocks(self, blocks):
-        """Sets the CurvatureBlocks and ScaleDirections of all sources (S)."""
+    def take_blocks(self, blocks, exchanges=()):
+        """Sets the CurvatureBlocks and ScaleDirections of all sources (S).
+
+        exchanges: the ExchangeDirections of each scene (B)
+        """
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []
-        self._set_directions(
-            {s: some[-1].values for s, some in enumerate(blocks) if _has_direction(some)}
-        )
+        own = [(s, some[-1].values) for s, some in enumerate(blocks) if _has_direction(some)]
+        found = [(scene[s], start[s] + np.arange(len(d)), d) for s, d in own]
+        for i, (some, at) in enumerate(zip(exchanges, b.host_first, strict=False)):
+            spectra = np.arange(*self._sizes[i, 1])
+            found += [
+                (
+                    i,
+                    np.concatenate([start[at + d.source] + d.places, spectra]),
+                    np.concatenate([d.values, d.spectra.ravel()]),
+                )
+                for d in some
+            ]
+        self._set_directions(sorted(found, key=lambda direction: direction[0]))
         blocks = [some[:-1] if _has_direction(some) else some for some in blocks]
         self.shelf.retain([block for some in blocks for block in some])
         listed = [(s, block) for s, some in enumerate(blocks) for block in some]
@@ -155,16 +168,19 @@ class LbfgsSteps:
             self._levels.append(((self._size[0], len(own)), given))
 
     def _set_directions(self, directions):
-        """Uploads {source: direction (n,)}."""
-        b, start, scene = self._buffers, self._latents.start, self._buffers.host_boxes.scene
-        self._directions = []
+        """Uploads directions (scene, places (k,), values (k,)), by scene."""
+        b, self._directions = self._buffers, []
         if directions:
-            d = np.zeros(self._vector_size)
-            for s, values in directions.items():
-                d[start[s] : start[s] + len(values)] = values
-            ranges = [[scene[s], start[s], len(values)] for s, values in directions.items()]
-            given = {"ranges": b.device.put(np.array(ranges), np.int32), "d": b.put(d)}
-            self._directions.append(((self._size[0], len(ranges)), given))
+            owner, places, values = zip(*directions, strict=True)
+            scenes, first = np.unique(owner, return_index=True)
+            ends = np.append(first[1:], len(owner))
+            given = {
+                "scenes": b.device.put(np.stack([scenes, first, ends], axis=1), np.int32),
+                "ends": b.device.put(np.cumsum([0, *map(len, places)]), np.int32),
+                "places": b.device.put(np.concatenate(places), np.int32),
+                "d": b.put(np.concatenate(values)),
+            }
+            self._directions.append(((self._size[0], len(scenes)), given))
 
 
 def _has_direction(blocks):
