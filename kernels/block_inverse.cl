@@ -8,9 +8,10 @@
  *
  * apply_block_inverse  H y and H P g_new by blocks, which share no variable; written over the old
  *           values or, with `more`, added to them; launch: (WG, n blocks), groups of (WG, 1)
- * add_directions  d d^T y and d d^T P g_new added to H y and H P g_new, with a direction d for each
- *           of n ranges of variables: ranges (n, 4) int: scene, first variable, their number,
- *           first element of d in factors / ALIGN;  launch: (WG, n), groups of (WG, 1)
+ * add_directions  d d^T y and d d^T P g_new added to H y and H P g_new for each direction d of n
+ *           scenes: scenes (n, 3) int: scene, first direction, last direction + 1;  ends (m + 1,)
+ *           int: first of each direction's elements, then the number of all;  places (k,) int and
+ *           d (k,): the elements' variables and values;  launch: (WG, n), groups of (WG, 1)
  */
 #include "common.h"
 #include "boxes.h"
@@ -150,26 +151,28 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void add_directions(__global const int *restrict ranges, __global const int *restrict plan,
-            const ulong size, __global const REAL *restrict factors, __global const REAL *restrict y,
+void add_directions(__global const int *restrict scenes, __global const int *restrict ends,
+            __global const int *restrict places, __global const REAL *restrict d,
+            __global const int *restrict plan, const ulong size, __global const REAL *restrict y,
             __global const REAL *restrict projected, __global REAL *restrict ring_hy,
             __global REAL *restrict hg_new)
 {
     __local REAL share[2 * WG];
-    const int lid = (int)get_local_id(0), range = (int)get_global_id(1);
+    const int lid = (int)get_local_id(0), scene = (int)get_global_id(1);
+    const int b = scenes[3 * scene], first = scenes[3 * scene + 1];
     /* idle scenes: none, as above */
-    const int b = ranges[4 * range], m = plan[3 * b] == REST ? 0 : ranges[4 * range + 2];
-    const size_t first = (size_t)ranges[4 * range + 1];
-    __global const REAL *d = factors + (size_t)ranges[4 * range + 3] * ALIGN;
-    __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size + first;
-    REAL total[2] = {0, 0};
-    for (int i = lid; i < m; i += WG) {
-        total[0] += d[i] * y[first + i];
-        total[1] += d[i] * projected[first + i];
-    }
-    GROUP_SUMS(total, 2, lid, share)
-    for (int i = lid; i < m; i += WG) {
-        hy[i] += d[i] * total[0];
-        hg_new[first + i] += d[i] * total[1];
+    const int last = plan[3 * b] == REST ? first : scenes[3 * scene + 2];
+    __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size;
+    for (int k = first; k < last; ++k) {
+        REAL total[2] = {0, 0};
+        for (int i = ends[k] + lid; i < ends[k + 1]; i += WG) {
+            total[0] += d[i] * y[places[i]];
+            total[1] += d[i] * projected[places[i]];
+        }
+        GROUP_SUMS(total, 2, lid, share)    /* its SYNC: sums of the direction before are written */
+        for (int i = ends[k] + lid; i < ends[k + 1]; i += WG) {
+            hy[places[i]] += d[i] * total[0];
+            hg_new[places[i]] += d[i] * total[1];
+        }
     }
 }

@@ -262,12 +262,12 @@ def test_transforms_do_what_the_matrix_between_pixels_does(step, shape, monkeypa
     """Also where answers are strong as far as they are taken, and pixels are further apart."""
     rng = np.random.default_rng(0)
     sharpness, images = rng.random(64 * 33), rng.normal(size=(40, *shape)).astype(np.float32)
-    wanted = inverse._through(sharpness, images, step)
+    wanted = inverse.seen_through(sharpness, images, step)
     np.testing.assert_array_equal(
         wanted, images.reshape(40, -1) @ inverse._between(sharpness, shape, step)
     )
     monkeypatch.setattr(inverse, "MANY_PIXELS", 0)
-    found = inverse._through(sharpness, images, step)
+    found = inverse.seen_through(sharpness, images, step)
     np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
 
 

@@ -5,6 +5,7 @@ import pytest
 from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.multiscale.exchange_direction import ExchangeDirection
 from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, SourceBlocks, _panels
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.lbfgs_steps import (
@@ -113,8 +114,8 @@ class Made:
     def held(self, x, g):
         return self.bounded & (x <= 0) & (g > 0)
 
-    def apply(self, vector, blocks):
-        """H of a vector (size,): h, but what the blocks of all levels say."""
+    def apply(self, vector, blocks, exchanges=()):
+        """H of a vector (size,): h, but what the blocks of all levels say, and exchanges."""
         out = self.host["h"] * vector
         for s, some in enumerate(blocks):
             for level in range(2):
@@ -125,7 +126,27 @@ class Made:
                     if getattr(block, "level", 1) == level:
                         before = out[where] if level else 0
                         out[where] = before + matrix @ vector[where]
+        for i, some in enumerate(exchanges):
+            for exchange in some:
+                d, source = np.zeros(len(out)), self.b.host_first[i] + exchange.source
+                d[self.latents.start[source] + exchange.places] = exchange.values
+                d[slice(*self.v.parts()[i, 1])] = exchange.spectra.ravel()
+                out += d * (d @ vector)
         return out
+
+
+def random_exchanges(made, seed=6):
+    """Two of each scene, of its sources with coefficients."""
+    rng, b, found = np.random.default_rng(seed), made.b, []
+    n = made.latents.shape.prod(2).sum(1)
+    for own in np.split(n, b.host_first[1:-1]):
+        found.append([])
+        for i in np.flatnonzero(own)[:2]:
+            places = rng.permutation(own[i])[: own[i] // 2]
+            values = rng.normal(size=len(places)), rng.normal(size=(len(own), b.n_channels))
+            found[-1].append(ExchangeDirection(i, places, *values))
+    assert max(map(len, found)) > 1
+    return found
 
 
 def random_blocks(made, seed=5):
@@ -159,13 +180,14 @@ def source_blocks(blocks):
 def test_inner_products_are_those_of_each_scene(build, dtype, with_blocks):
     m = Made(build, dtype)
     blocks = random_blocks(m) if with_blocks else [[]] * len(m.b.host_boxes)
-    m.steps.take_blocks(source_blocks(blocks))
+    exchanges = random_exchanges(m) if with_blocks else []
+    m.steps.take_blocks(source_blocks(blocks), exchanges)
     x, g, s, hy = (m.host[k] for k in ("x", "g", "s", "hy"))
     sums, slope, energy = m.steps.change()
     on = m.scene < 2
     y = np.where(on, m.host["g_new"] - g, 0)
     s, hy = s.copy(), hy.copy()
-    s[0, on], hy[0, on] = (m.host["x_new"] - x)[on], m.apply(y, blocks)[on]
+    s[0, on], hy[0, on] = (m.host["x_new"] - x)[on], m.apply(y, blocks, exchanges)[on]
     close(m.get("s"), s, dtype)
     close(m.get("hy"), hy, dtype)
     free_g = np.where(m.held(m.host["x_new"], m.host["g_new"]), 0, m.host["g_new"])

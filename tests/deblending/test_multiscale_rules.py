@@ -189,6 +189,7 @@ def test_scenes_update_strengths_when_due_though_others_do_not(due):
         strengths_due=lambda _: np.array(due),
         significance_due=lambda _: np.zeros(2, bool),
         next_actions=lambda _: (None, None, None),
+        exchanges_due=lambda: np.zeros(2, bool),
         n_rounds=np.zeros(2, int),
     )
     one.strengths = SimpleNamespace(take_blocks=lambda _: None)

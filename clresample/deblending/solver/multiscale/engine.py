@@ -61,15 +61,17 @@ class MultiscaleEngine:
             spectra = np.concatenate([s.spectra for s in states])
             self.strengths.request_blocks(spectra, self.progress.n_rounds)
             self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
+            self._exchanges = [[] for _ in scenes]
         else:
             engine, keep = past
+            self._exchanges = [engine._exchanges[i] for i in keep]
             self.progress, self.pairs = engine.progress.take(keep), engine.pairs.subset(keep)
             self.strengths = PriorStrengths(
                 b, self._gradient, latents, prior, past=(engine.strengths, keep)
             )
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
-        self.steps.take_blocks(self.strengths.schedule.blocks)
+        self.steps.take_blocks(self.strengths.schedule.blocks, self._exchanges)
 
     def subset(self, keep):
         """An engine of the scenes `keep` (n,) alone, which continue unchanged."""
@@ -89,8 +91,13 @@ class MultiscaleEngine:
         returns accepted (B,): scenes whose progress.loss is new
         """
         p, blocks = self.progress, self.strengths.take_blocks(self.progress.n_rounds)
+        exchanging = p.exchanges_due()
+        if exchanging.any():
+            found = self.strengths.find_exchanges(exchanging, self.states(exchanging))
+            self._exchanges = [found.get(i, now) for i, now in enumerate(self._exchanges)]
+            blocks = self.strengths.schedule.blocks
         if blocks is not None:
-            self.steps.take_blocks(blocks)
+            self.steps.take_blocks(blocks, self._exchanges)
         sums, slope, loss = self._evaluate()
         accepted, stepped = p.accept_trials(loss, slope)
         new = np.flatnonzero(stepped)

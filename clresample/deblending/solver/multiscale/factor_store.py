@@ -1,4 +1,4 @@
-"""Stores factors of inverse curvature on the device and uploads only new ones."""
+"""Stores the factors of all sources' blocks on the device and uploads only new ones."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ ROOM, MIN_USED = 1.5, 0.25
 
 
 class FactorStore:
-    """Stores the factors of blocks in one array on a device, of a floating type.
-
-    A block is a CurvatureBlock or a ScaleDirection.
+    """Stores the Cholesky factors of blocks in one array on a device, of a floating type.
 
     values: the array; those of a block begin at `first(block)`
     """
@@ -25,11 +23,11 @@ class FactorStore:
         self._first, self._end = {}, 0
 
     def first(self, block):
-        """The first element of a block's factor, a multiple of ALIGN."""
+        """The first element of a CurvatureBlock's factor, a multiple of ALIGN."""
         return self._first[block]
 
     def retain(self, blocks):
-        """Keeps the factors of these blocks and drops all others."""
+        """Keeps the factors of these CurvatureBlocks and drops all others."""
         need = sum(_room(block) for block in blocks)
         new = [block for block in blocks if block not in self._first]
         full = self._end + sum(_room(block) for block in new) > self.values.size
@@ -43,7 +41,7 @@ class FactorStore:
         start = self._end
         for block in new:
             at = self._end - start
-            flat[at : at + block.factor.size] = block.factor
+            flat[at : at + block.cholesky.size] = block.cholesky
             self._first[block] = self._end
             self._end += _room(block)
         if new:
@@ -51,5 +49,5 @@ class FactorStore:
 
 
 def _room(block):
-    """Number of elements of a block's factor, with its padding."""
-    return -(-block.factor.size // ALIGN) * ALIGN
+    """Number of elements of a CurvatureBlock's factor."""
+    return -(-block.cholesky.size // ALIGN) * ALIGN

@@ -58,12 +58,12 @@ class CurvatureBlock:
 
     level: see SourceBlocks
     indices (m,): of the coefficients among all of the source's, scale by scale
-    factor: W, lower triangular, in panels, see `_panels`
+    cholesky: W, lower triangular, in panels, see `_panels`
     """
 
     level: int
     indices: np.ndarray
-    factor: np.ndarray
+    cholesky: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class BlockPreconditioner:
     def _scale_direction(self, strengths, spectrum):
         """The ScaleDirection (all coefficients,), of curvature 1 in the prior and data together."""
         z, change = scale_coefficients(self._evidence.prior, self._profile, strengths)
-        seen = _through(self._evidence.sharpness(spectrum), change[None], 1)
+        seen = seen_through(self._evidence.sharpness(spectrum), change[None], 1)
         curvature = sum((part**2).sum() / a**2 for part, a in zip(z, strengths, strict=True))
         curvature += max(seen[0] @ change.ravel(), 0)
         return ScaleDirection(np.concatenate([part.ravel() for part in z]) / np.sqrt(curvature))
@@ -159,7 +159,7 @@ class BlockPreconditioner:
         near = (size >= MIN_RELATIVE_SIZE * size.max((1, 2), keepdims=True)).any(0)
         y, x = (np.flatnonzero(near.any(axis)) for axis in (1, 0))
         u = u[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-        seen = _through(self._evidence.sharpness(spectrum), u, step)
+        seen = seen_through(self._evidence.sharpness(spectrum), u, step)
         return seen @ u.reshape(len(rows), -1).T
 
     def _seen(self, j, places, window, step):
@@ -199,7 +199,7 @@ def _binned(values, axis, step):
     return np.moveaxis(out, 0, axis)
 
 
-def _through(sharpness, images, step):
+def seen_through(sharpness, images, step):
     """T (n, n) times images (m, ny, nx), of n pixels, as rows (m, n); see `_between`."""
     shape = images.shape[1:]
     if shape[0] * shape[1] < MANY_PIXELS:

@@ -45,6 +45,9 @@ LATE_LOOK, FALLING = 80, 50.0
 # 0.8, 0.05, 0.2 and 0.01 with 0.2, and all below 0.02 with 0.1 (bench.ladder, giant). Simulated
 # scenes take a sixth more iterations and 3 % more time, with the same SDRs (bench.settings).
 CONVERGENCE_WINDOW, MAX_REMAINDER, MIN_FALL = 5, 0.1, 0.01
+# [rounds] of a scene before its ExchangeDirections are found, and between two times: most scenes
+# have ended before, and those that last change their light, spectra and bounds on the way.
+FIRST_EXCHANGE_ROUND, EXCHANGE_ROUNDS = 40, 20
 
 
 class LbfgsControl:
@@ -105,6 +108,11 @@ class LbfgsControl:
         self._losses[accepted, 0] = self.loss[accepted] = loss[accepted]
         self._fresh &= ~accepted
         return accepted, stepped
+
+    def exchanges_due(self):
+        """Selects scenes (B,) whose ExchangeDirections are found now."""
+        n = self.n_rounds - FIRST_EXCHANGE_ROUND
+        return self.live & (n >= 0) & (n % EXCHANGE_ROUNDS == 0)
 
     def strengths_due(self, accepted):
         """Selects scenes (B,) whose strengths are updated now."""

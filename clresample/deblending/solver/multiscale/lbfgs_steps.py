@@ -23,7 +23,7 @@ class LbfgsSteps:
         v, n_slots = vectors, vectors.n_slots
         b, self._latents = v.buffers, v.latents
         self._buffers = b
-        self._n_slots, self._n_chunks = n_slots, len(v.chunks)
+        self._n_slots, self._n_chunks, self._sizes = n_slots, len(v.chunks), v.parts()
         self._first_chunks = np.flatnonzero(np.diff(v.chunks[:, 0], prepend=-1))
         n = len(b.scenes)
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
@@ -128,14 +128,29 @@ class LbfgsSteps:
         if b.n_free:
             self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
 
-    def take_blocks(self, blocks):
-        """Sets the SourceBlocks of all sources (S)."""
+    def take_blocks(self, blocks, exchanges=()):
+        """Sets the SourceBlocks of all sources (S).
+
+        exchanges: the ExchangeDirections of each scene (B)
+        """
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
-        self._levels, self._directions = [], []
+        self._levels = []
+        own = [(s, some.direction.values) for s, some in enumerate(blocks) if some.direction]
+        found = [(scene[s], start[s] + np.arange(len(d)), d) for s, d in own]
+        for i, (some, at) in enumerate(zip(exchanges, b.host_first, strict=False)):
+            spectra = np.arange(*self._sizes[i, 1])
+            found += [
+                (
+                    i,
+                    np.concatenate([start[at + d.source] + d.places, spectra]),
+                    np.concatenate([d.values, d.spectra.ravel()]),
+                )
+                for d in some
+            ]
+        self._set_directions(sorted(found, key=lambda direction: direction[0]))
         listed = [(s, block) for s, some in enumerate(blocks) for block in some.blocks]
-        whole = [(s, some.direction) for s, some in enumerate(blocks) if some.direction]
-        self.shelf.retain([block for _, block in listed + whole])
+        self.shelf.retain([block for _, block in listed])
         for level in range(1 + max((block.level for _, block in listed), default=-1)):
             own = [(s, block) for s, block in listed if block.level == level]
             sizes = [len(block.indices) for _, block in own]
@@ -149,9 +164,18 @@ class LbfgsSteps:
                 "more": level > 0,
             }
             self._levels.append(((self._size[0], len(own)), given))
-        if whole:
-            rows = [
-                [scene[s], start[s], d.factor.size, self.shelf.first(d) // ALIGN] for s, d in whole
-            ]
-            given = {"ranges": b.device.put(rows, np.int32), "factors": self.shelf.values}
-            self._directions.append(((self._size[0], len(rows)), given))
+
+    def _set_directions(self, directions):
+        """Uploads directions (scene, places (k,), values (k,)), by scene."""
+        b, self._directions = self._buffers, []
+        if directions:
+            owner, places, values = zip(*directions, strict=True)
+            scenes, first = np.unique(owner, return_index=True)
+            ends = np.append(first[1:], len(owner))
+            given = {
+                "scenes": b.device.put(np.stack([scenes, first, ends], axis=1), np.int32),
+                "ends": b.device.put(np.cumsum([0, *map(len, places)]), np.int32),
+                "places": b.device.put(np.concatenate(places), np.int32),
+                "d": b.put(np.concatenate(values)),
+            }
+            self._directions.append(((self._size[0], len(scenes)), given))

@@ -16,29 +16,38 @@ import numpy as np
 
 from .prior import kernel_rows
 
-# Conjugate gradients for u = p, and the variance [1] that is added to the prior's of u / sqrt(p):
-# with 30 and 1e-5 the data's curvature along the direction is a tenth of the prior's for a giant of
-# signal to noise 7000 (bench.ladder), and five times it with 10 and 1e-4.
+# Conjugate gradients for a wanted u, and the variance [1] that is added to the prior's of
+# u / sqrt(p): with 30 and 1e-5 the data's curvature along the direction is a tenth of the prior's
+# for a giant of signal to noise 7000 (bench.ladder), and five times it with 10 and 1e-4.
 N_STEPS, VARIANCE = 30, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleDirection:
-    """The direction d of one source, scaled to d^T H d = 1: factor (all its coefficients,)."""
+    """The direction d of one source, scaled to d^T H d = 1: values (all its coefficients,)."""
 
-    factor: np.ndarray
+    values: np.ndarray
 
 
 def scale_coefficients(prior, profile, strengths):
-    """Coefficients [j] (ny_j, nx_j) with u = p, nearly, and the change (ny, nx) of S by them.
+    """Coefficients [j] (ny_j, nx_j) with u = p, nearly, and the change (ny, nx) of S by them."""
+    z, u = coefficients_of(prior, profile, profile, strengths)
+    return z, u - profile * ((profile * u).sum() / (profile * profile).sum())
 
-    They are alpha_j^2 K_j^T (sqrt(p) q), (sqrt(p) P sqrt(p) + VARIANCE) q = p,
+
+def coefficients_of(prior, profile, wanted, strengths, window=None):
+    """Coefficients [j] (ny_j, nx_j) whose u is nearly the image `wanted` (my, mx), and their u.
+
+    They are alpha_j^2 K_j^T (sqrt(p) q), (sqrt(p) P sqrt(p) + VARIANCE) q = wanted,
     P = sum_j alpha_j^2 K_j K_j^T.
+
+    window: the slices of the profile (ny, nx) that are the image; None = all of it
     """
     from scipy import fft  # takes 0.05 s, not needed by small galaxies
 
-    root, variance = prior.amplitude(profile), np.square(strengths).astype(np.float32)
-    shape = profile.shape
+    window = window or tuple(slice(0, n) for n in profile.shape)
+    root = prior.amplitude(profile[window])
+    variance, shape = np.square(strengths).astype(np.float32), root.shape
     size = [fft.next_fast_len(n + 2 * max(prior.radii), real=True) for n in shape]
     power = 0
     for part, taps in zip(variance, prior.kernels(), strict=True):
@@ -50,7 +59,7 @@ def scale_coefficients(prior, profile, strengths):
         waves = fft.rfft2(root * q, size) * power
         return root * fft.irfft2(waves, size)[: shape[0], : shape[1]] + VARIANCE * q
 
-    q, left = np.zeros_like(profile), profile.copy()
+    q, left = np.zeros_like(wanted), wanted.copy()
     step, size2 = left.copy(), (left * left).sum()
     for _ in range(N_STEPS):
         curved = observed(step)
@@ -59,7 +68,9 @@ def scale_coefficients(prior, profile, strengths):
         left -= length * curved
         before, size2 = size2, (left * left).sum()
         step = left + size2 / max(before, 1e-30) * step
-    sides = [[kernel_rows(prior, j, n) for n in shape] for j in range(len(variance))]
+    sides = [
+        [kernel_rows(prior, j, n)[:, at] for n, at in zip(profile.shape, window, strict=True)]
+        for j in range(len(variance))
+    ]
     z = [v * (y @ (root * q) @ x.T) for v, (y, x) in zip(variance, sides, strict=True)]
-    u = root * sum(y.T @ part @ x for part, (y, x) in zip(z, sides, strict=True))
-    return z, u - profile * ((profile * u).sum() / (profile * profile).sum())
+    return z, root * sum(y.T @ part @ x for part, (y, x) in zip(z, sides, strict=True))

@@ -9,6 +9,7 @@ import numpy as np
 from ....device.multi_device import host_threads, map_threads
 from .block_schedule import BlockSchedule
 from .evidence import LocalPowerSpectra, SourceEvidence, blurred_light
+from .exchange_direction import find_exchange_directions
 from .inverse import BlockPreconditioner
 from .response import OperatorResponse
 
@@ -113,6 +114,20 @@ class PriorStrengths:
     def take_blocks(self, rounds):
         """Takes blocks whose time has come; returns those of all sources (S) if any did."""
         return self.schedule.blocks if self.schedule.take(rounds) else None
+
+    def find_exchanges(self, which, states):
+        """Finds {scene: its ExchangeDirections} of the scenes `which` (B,) at their states (B)."""
+        chosen, first = np.flatnonzero(which).tolist(), self.buffers.host_first
+        parts = [slice(first[i], first[i + 1]) for i in chosen]
+
+        def find(k):
+            i, own = chosen[k], parts[k]
+            given = self._evidence[own], self.values[own]
+            found[i] = find_exchange_directions(self.buffers.scenes[i], states[i], *given)
+
+        found = {}
+        map_threads(host_threads(self.buffers.device), find, range(len(chosen)))
+        return found
 
     def find_significant(self, due, energies, spectra):
         """Finds significant sources of the scenes `due` (B,); returns scenes (B,) with new ones."""
