@@ -7,7 +7,7 @@ import pytest
 from helpers import scenes
 from helpers.blends import blend, gaussian, observe, round_component
 
-from clresample import Flag, Grid, PointSource, catalogue, deblend, summary
+from clresample import Flag, Grid, PointSource, catalogue, deblend, fluxes, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.status import with_misfit_status
 from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, fine_scatter
@@ -154,9 +154,24 @@ def test_scatter_about_neighbours_is_that_of_white_noise_and_not_of_light():
 def test_a_galaxy_given_as_a_point_is_a_misfit_and_a_star_is_none(device, sigma_px, misfit, angle):
     """No pixel of its residual, filtered with the PSF, is significant."""
     objects = [((14.2, 17.1), (20, 14, 18), sigma_px)]
-    images = scenes.observe(objects, noise=0.45, seed=4, angle=angle)
+    images = scenes.observe(objects, noise=0.5, seed=4, angle=angle)
     point = PointSource(position_px=objects[0][0])
     found = deblend(images, [point], frame=scenes.frame(), device=device)
     assert found.converged and np.nanmax(found.misfit.residuals) < MISFIT_SIGMAS
     assert flagged(found) == [misfit]
     assert (found.misfit.wide_part[0] > 0.3) == misfit
+
+
+@pytest.mark.parametrize("sigma_px, kind", [(3.0, "galaxy"), (0, "star")])
+def test_errors_of_a_faint_point_hold_the_light_around_it(sigma_px, kind):
+    """It is too faint for a misfit; its light is 20, 14 and 18."""
+    objects = [((14.2, 17.1), (20, 14, 18), sigma_px)]
+    images = scenes.observe(objects, noise=0.9, seed=4)
+    found = deblend(images, [PointSource(position_px=objects[0][0])], frame=scenes.frame())
+    (flux,), covariance = fluxes(found)
+    error = np.sqrt(covariance[:, 0, 0])
+    assert flagged(found) == [False]
+    if kind == "star":
+        np.testing.assert_allclose(error, [3.03, 3.63, 3.64], rtol=0.03)
+    else:
+        assert (np.abs(flux - (20, 14, 18)) < 2 * error).all() and (error > 2 * flux).all()

@@ -9,7 +9,7 @@ import numpy as np
 from ...sky.noise import HALF_WIDTH
 from ..component_images import image_within, window_of
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
-from .extended import extended_light
+from .extended import WIDE_SIGMAS, extended_light
 
 # Fraction of a source's flux in a channel from which a significant residual is a misfit. Smaller
 # residuals are within three errors of bright galaxies, which are about 1 %
@@ -70,14 +70,14 @@ class Misfit:
     def fraction(self) -> np.ndarray:
         """Residual light over flux (S,), in the channel where it is largest.
 
-        0 where no channel has over 5 sigma.
+        0 where no channel has over 5 sigma, and no light around a point has over WIDE_SIGMAS.
         """
         part = np.where(self._own_sigma > MISFIT_SIGMAS, self.light / self.flux, 0.0)
-        wide = np.where(self.wide_sigma > MISFIT_SIGMAS, self.wide_part, 0.0)
+        wide = np.where(self.wide_sigma > WIDE_SIGMAS, self.wide_part, 0.0)
         return np.maximum(part.max(axis=1, initial=0.0), wide)
 
     def sources(self) -> np.ndarray:
-        """Selects misfitted sources (S,): over 5 sigma and over MISFIT_FRACTION of the flux."""
+        """Selects misfitted sources (S,): those with a `fraction` over MISFIT_FRACTION."""
         return self.fraction() > MISFIT_FRACTION
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened, with_common_error
+from ..assessment.extended import missed_light
 from ..assessment.status import with_misfit_status
 from ..result import noted
 from .aligned_observation import align_observations
@@ -210,6 +211,7 @@ def with_errors(fit, result, peaks, seen):
     cores = core_errors(result, fit.settings.psf_error)
     wings = np.zeros_like(outside)
     wings[fit.fitted] = start.wings * fit.unit
+    wings = np.hypot(wings, missed_light(result))
     errors = with_core_errors(widened(with_common_error(errors, wings), outside), cores)
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
     exchanged = exchanged_light(result, start.source, fit.scene)
