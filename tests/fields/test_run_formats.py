@@ -36,5 +36,5 @@ def test_a_run_of_another_format_is_overwritten_where_that_is_asked_for(tmp_path
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "run.json").write_text(json.dumps({"format": 1}))
     opened(tmp_path, overwrite=True)
-    assert json.loads((tmp_path / "work" / "run.json").read_text())["format"] == 3
+    assert json.loads((tmp_path / "work" / "run.json").read_text())["format"] == 4
     opened(tmp_path)  # its own goes on

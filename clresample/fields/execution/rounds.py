@@ -71,7 +71,7 @@ def fit_all_groups(job, engine, progress):
                 patches,
                 n_round,
                 history.light_about(patches),
-                history.components_of(patches),
+                history.profiles_of(patches),
                 history.found_in(patches),
             )
             for i, patches in enumerate(groups)
@@ -140,16 +140,20 @@ class _PieceHistory:
         """`FitGroup.found` of some pieces: all that was found in their residuals so far."""
         return tuple(row for patch in patches for row in self.found.get(patch, ()))
 
-    def components_of(self, patches):
-        """`FitGroup.components` of some pieces, by their last fits.
+    def profiles_of(self, patches):
+        """`FitGroup.profiles` of some pieces, those of their last fits.
 
-        They are not tested again in each round, because a borderline source would alternate.
+        Numbers of components are not tested again in each round, because a borderline source would
+        alternate.
         """
-        found: dict[int, int] = {}
+        found: dict[int, tuple] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
-            for source, patch in _owners(_file(self.job, name)):
+            part = _file(self.job, name)
+            (thetas,) = part.read("THETAS")
+            for (source, patch), theta in zip(_owners(part), thetas, strict=True):
                 if patch in patches:
-                    found[source] = found.get(source, 0) + 1
+                    own = tuple(theta[np.isfinite(theta)].tolist())
+                    found[source] = (*found.get(source, ()), own)
         return tuple(sorted(found.items()))
 
     def moved(self, patches):
