@@ -155,6 +155,21 @@ class GroupResultsFile:
             chosen = [hdus[name] for name in names]
             return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
 
+    def owners(self) -> list[tuple[int, int]]:
+        """(id of the source, patch) of each component."""
+        (table,) = self.read("COMPONENTS")
+        return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
+
+    def profiles(self, chosen) -> dict[int, tuple[tuple[float, ...], ...]]:
+        """Parameters {id: (n,) of each component} of the sources of the patches in `chosen`."""
+        found: dict[int, tuple] = {}
+        (thetas,) = self.read("THETAS")
+        for (source, patch), theta in zip(self.owners(), thetas, strict=True):
+            if patch in chosen:
+                own = tuple(theta[np.isfinite(theta)].tolist())
+                found[source] = (*found.get(source, ()), own)
+        return found
+
     def offsets(self) -> np.ndarray:
         """The rows of `GroupResults.offsets`."""
         with open_fits(self.path) as hdus:

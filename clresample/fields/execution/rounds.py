@@ -148,12 +148,7 @@ class _PieceHistory:
         """
         found: dict[int, tuple] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
-            part = _file(self.job, name)
-            (thetas,) = part.read("THETAS")
-            for (source, patch), theta in zip(_owners(part), thetas, strict=True):
-                if patch in patches:
-                    own = tuple(theta[np.isfinite(theta)].tolist())
-                    found[source] = (*found.get(source, ()), own)
+            found |= _file(self.job, name).profiles(patches)
         return tuple(sorted(found.items()))
 
     def moved(self, patches):
@@ -183,18 +178,12 @@ class _PieceHistory:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
             part = _file(self.job, name)
-            rows, where = part.read("CATALOGUE")[0], dict(_owners(part))
+            rows, where = part.read("CATALOGUE")[0], dict(part.owners())
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
                     found[source] = where[source], flux[k], error[k]
         return found
-
-
-def _owners(part):
-    """(id of the source, patch) of each component in a GroupResultsFile."""
-    (table,) = part.read("COMPONENTS")
-    return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
 
 
 def _columns(rows, kind, job):
