@@ -30,12 +30,15 @@ class Blend:
     shifts (n_observations, 2) [model px]: of the observations' pixels, if known; a fit of shifts
         starts from them. If a fit finds a shift of more than a pixel, start a second fit from it,
         because the profiles of the first came from images that disagreed
+    thetas (S): `Result.thetas` of an earlier fit of these sources on a frame of the same pixels,
+        None or () for sources that it did not have; their profiles start from them. (): for none
     """
 
     observations: tuple[Observation, ...]
     sources: tuple[Source, ...]
     frame: Frame | None = None
     shifts: np.ndarray | None = None
+    thetas: tuple = ()
 
     def check(self):
         """Raises ValueError if an observation, a source or the frame has another type."""

@@ -86,7 +86,9 @@ class Fit:
     def patch(self) -> StartInput:
         """Inputs of the start of this fit."""
         i = self.fitted
-        return StartInput(self.frame, [self.sources[k] for k in i], self._positions[i], self.views)
+        thetas = self.blend.thetas or [None] * len(self.sources)
+        sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
+        return StartInput(self.frame, sources, self._positions[i], self.views, thetas)
 
     @property
     def signature(self):
@@ -175,10 +177,19 @@ class Fit:
             shifts=self.shifts,
             losses=np.array(self.losses),
             status=self.status,
+            thetas=self._thetas(),
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
         return with_errors(self, result, peaks, seen)
+
+
+    def _thetas(self):
+        """Parameters of the profiles, see Result."""
+        found: list[tuple] = [()] * len(self.sources)
+        for i, theta in zip(self.fitted[self.start.source], self.start.thetas, strict=True):
+            found[i] += (theta,)
+        return tuple(found)
 
 
 def start_fits(fits):

@@ -72,6 +72,9 @@ class Result(ResultDisplay):
     status: an Ended, which compares as its text: "converged", "misfit" (its steps ended, but the
         model does not describe the data, see `Misfit.is_wrong`), "iteration limit", "diverged" or
         "interrupted"
+    thetas (S): of each source a tuple of its components' parameters (n,), of the smooth profiles
+        from which the fit began; another fit of these sources may start from them, see Blend. (): of
+        a result that was read
     messages: for the user, a line each; seconds: wall time by stage
     """
 
@@ -87,6 +90,7 @@ class Result(ResultDisplay):
     status: Ended
     errors: Errors | None = None
     draws: PosteriorSampler | None = None
+    thetas: tuple = ()
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 

@@ -7,6 +7,7 @@ import pytest
 
 from clresample.deblending.start import profile_fit
 from clresample.deblending.start.linearised_scenes import LinearisedScenes
+from clresample.deblending.start.population import OWN_LIGHT
 from clresample.deblending.start.profile_fit import ProfileFit
 
 
@@ -84,6 +85,20 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
     np.testing.assert_allclose(looking.spectra[:, 0], fit.theta[:, 0, 0])
     # 0.7, 0.7, 0.5 and what the damping left; a scene at its end tries until damping is too large
     assert (looking.n_looks - before)[0] < (looking.n_looks - before)[1] <= 6
+
+
+def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
+    """In fewer trials; they are not started a second time, unlike those that grew as much."""
+    fit, looking = valley([1.9, 1.9, 3.4])
+    again: list[int] = []
+    monkeypatch.setattr(fit.expected, "galaxies", np.ones((3, 1), bool))
+    monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: again.extend(scenes))
+    before = looking.n_looks.copy()
+    fit.run({0: [1.8, 0, 0, 0]})
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
+    n_trials = looking.n_looks - before
+    assert n_trials[0] < n_trials[1] and again == [1, 2]
+    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, 0]
 
 
 def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):

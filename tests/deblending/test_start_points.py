@@ -1,5 +1,6 @@
 """Components of sources, starting points, and sources far from light, on numbers made by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -148,3 +149,14 @@ def test_sources_are_dark_where_no_light_lies_beside_them(beside):
         np.testing.assert_allclose(c.shape.mean - usual, [np.log(6), 0, 0, 0])
     looking.signal_to_noise = lambda level: np.full((7, 2), 99.0)
     assert not any(dark.any() for dark in room._dark(given, sources, looking)) and len(looked) == 1
+
+
+def test_known_parameters_are_those_of_sources_with_as_many_components():
+    thetas = [np.array([0.1, 0.2])], [np.zeros(4), np.ones(4)], [np.zeros(0)]
+    first, second = patches()
+    known = replace(first, thetas=thetas), replace(second, thetas=([np.ones(4)] * 2,))
+    found = room._known(known, room._components(known)[1])
+    assert {k: theta.tolist() for k, theta in found.items()} == {
+        0: [0.1, 0.2], 1: [0.0] * 4, 2: [1.0] * 4, 3: [],
+    }  # fmt: skip
+    assert room._known([first, replace(second, thetas=(None,))], room._components(known)[1]) == {}

@@ -68,8 +68,8 @@ def test_sources_that_failed_leave_whole_numbers_whole(part, tmp_path):
 
 def test_patches_components_and_models_come_back(part, tmp_path):
     morphology = np.arange(6.0).reshape(2, 3)
-    part.add_component(11, PATCH, np.array([8, 9]), morphology, np.array([1.0, np.nan]))
-    part.add_component(12, PATCH, np.array([1, 2]), 2 * morphology, np.array([3.0, 4.0]))
+    part.add_component(11, PATCH, np.array([8, 9]), morphology, np.array([1.0, np.nan]), [0.5])
+    part.add_component(12, PATCH, np.array([1, 2]), 2 * morphology, np.array([3.0, 4.0]), [])
     models = {0: np.full((1, 4, 5), 2.5), 1: np.arange(12.0).reshape(2, 2, 3)}
     boxes = {0: Box(0, 1, 4, 6), 1: Box(7, 8, 9, 11)}
     for i, model in models.items():
@@ -93,10 +93,20 @@ def test_patches_components_and_models_come_back(part, tmp_path):
     assert [m[1] for m in file.models(mosaic=1)] == [m[1] for m in found if m[1] == 1]
 
 
+def test_profiles_come_back_digit_by_digit_of_the_patches_asked_for(part, tmp_path):
+    one, star = (0.1, 0.2, -1 / 3, np.log(6.5)), (0.5, -0.5)
+    rows = (11, PATCH, one), (11, PATCH, one[::-1]), (12, PATCH, star), (13, PATCH, ())
+    for number, patch, theta in (*rows, (14, replace(PATCH, number=8), one)):
+        part.add_component(number, patch, np.zeros(2), np.ones((2, 3)), np.ones(2), theta)
+    file, _ = read(part, tmp_path)
+    assert file.profiles({7}) == {11: (one, one[::-1]), 12: (star,), 13: ((),)}
+    assert file.profiles({8}) == {14: (one,)} and file.profiles(()) == {}
+
+
 def test_an_empty_part_is_a_file_too(tmp_path):
     file, _ = read(GroupResults(), tmp_path)
     assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
-    assert list(file.models()) == []
+    assert list(file.models()) == [] and file.profiles({7}) == {}
 
 
 def test_files_are_fits_as_others_see_them(part, tmp_path):

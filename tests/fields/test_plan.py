@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from clresample.deblending.blend import Blend
 from clresample.fields.blends.cut import FitLimits, cut_blend
-from clresample.fields.blends.cutouts import listed_source
+from clresample.fields.blends.cutouts import listed_source, with_profiles
 from clresample.fields.blends.link import link_footprints
 from clresample.fields.blends.plan import STEP_PX, FitPlan, make_fit_plan, source_ids
 from clresample.fields.blends.search import TileDetections, grown_footprints
@@ -123,11 +124,25 @@ def test_stars_of_a_plan_are_points_in_its_fits():
     plan = FitPlan.from_json(plan.to_json())
     assert plan.stars == (int(plan.ids[4]),)
     (patch,) = [p for p in plan.patches if 4 in p.sources]
-    star, galaxy = (listed_source(patch, plan, s, {int(plan.ids[s]): 2}) for s in (4, 3))
+    star, galaxy = (listed_source(patch, plan, s) for s in (4, 3))
     assert isinstance(star, PointSource) and star.free_position
-    assert isinstance(galaxy, ExtendedSource) and galaxy.n_components == 2
+    assert isinstance(galaxy, ExtendedSource) and galaxy.n_components is None
     assert star.name == str(plan.ids[4])
     np.testing.assert_allclose(star.position_px, plan.positions[4] - patch.box[:2])
+
+
+@pytest.mark.parametrize(("single", "counts"), [(1, [1, 2, None]), (None, [None, 2, None])])
+def test_sources_go_on_from_the_profiles_of_an_earlier_fit(single, counts):
+    """With as many components, unless a single one is left to the data; new ones from nothing."""
+    galaxies = [ExtendedSource(position_px=(i, 0), name=str(10 + i)) for i in range(3)]
+    star = PointSource(position_px=(9, 0), name="20", free_position=True)
+    own, two = ((1.0, 0, 0, 2.0),), ((0.5, 0, 0, 2.0), (1.5, 0, 0, 2.0))
+    blend = with_profiles(
+        Blend((), (*galaxies, star)), {10: own, 11: two, 20: ((0.1, 0.2),)}, single=single
+    )
+    assert [source.n_components for source in blend.sources[:3]] == counts
+    assert blend.sources[3] == star
+    assert blend.thetas == (own, two, (), ((0.1, 0.2),))
 
 
 def test_ids_do_not_depend_on_the_run_and_say_where():

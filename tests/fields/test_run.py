@@ -178,18 +178,19 @@ def test_tiles_leave_no_seams(done, sky, tmp_path, tile_px, n_tiles):
 @pytest.fixture(scope="module")
 def cut(done, sky, tmp_path_factory):
     """The folder of a run whose largest blends are cut; and of each blend that was fitted whether
-    it was a later round's, and the numbers of components that it was given."""
+    it was a later round's, and the numbers of components and profiles that it was given."""
     largest = int(table(done[0])["n_blend_sources"].max())
     options, folder = FieldOptions(limits=FitLimits(max_sources=largest - 1)), tmp_path_factory
-    folder, given, blend_of = folder.mktemp("cut"), [], fitting.make_blend
+    folder, given, with_profiles = folder.mktemp("cut"), [], fitting.with_profiles
 
-    def noted(patch, *others):
-        blend, boxes = blend_of(patch, *others)
-        given.append((others[-2] is not None, [s.n_components for s in blend.sources]))
-        return blend, boxes
+    def noted(blend, profiles, *, single):
+        blend = with_profiles(blend, profiles, single=single)
+        counts = [s.n_components for s in blend.sources]
+        given.append((bool(profiles), counts, [len(own) for own in blend.thetas]))
+        return blend
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "make_blend", noted)
+        patch.setattr(fitting, "with_profiles", noted)
         run_field(mosaics_of(sky), folder, options=options)
     return folder, given
 
@@ -208,10 +209,11 @@ def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, cut):
     assert n_others == 0 and np.median(np.abs(differences)) < 0.5
 
 
-def test_later_rounds_keep_the_number_of_components(cut):
-    """That an earlier one found; the first leaves it to the data."""
-    first, later = ([n for is_later, ns in cut[1] if is_later == k for n in ns] for k in (0, 1))
-    assert set(first) == {None} and later and None not in later
+def test_later_rounds_keep_the_components_and_go_on_from_their_profiles(cut):
+    """Those of the fit before; the first leaves them to the data."""
+    first, later = ([own for own in cut[1] if own[0] == k] for k in (False, True))
+    assert first and all(set(ns) == {None} and not any(known) for _, ns, known in first)
+    assert later and all(ns == known and 0 not in known for _, ns, known in later)
 
 
 def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...sky.sources import ExtendedSource
 from ..ended import Ended
-from ..profiles import FixedProfile, GalaxyProfile
+from ..profiles import COMPONENT_SPREAD, FixedProfile, GalaxyProfile
 from ..solver.multiscale.structure import coarse_count
 from ..solver.scene import StructureState
 from ..start.final_render import render_models
@@ -94,14 +94,22 @@ def _together(fit, chosen):
     Other galaxies of one component have the profiles of the first fit's start.
     """
     begin, sources = fit.start, list(fit.patch.sources)
+    thetas: list = [None] * len(sources)
     for i, source in enumerate(sources):
         own = np.flatnonzero(begin.source == i)
+        thetas[i] = [begin.thetas[k] for k in own]
         if own[0] in chosen:
-            sources[i] = replace(source, n_components=2)
+            sources[i], thetas[i] = replace(source, n_components=2), _split(*thetas[i])
         elif len(own) == 1 and isinstance(begin.shapes[own[0]], GalaxyProfile):
             profile = begin.drawn(own[0], (0, 0), fit.frame.shape)
             sources[i] = replace(source, profile=profile, n_components=None)
-    return replace(fit.patch, sources=sources)
+    return replace(fit.patch, sources=sources, thetas=thetas)
+
+
+def _split(theta):
+    """Parameters of two components of a profile, one smaller and one larger than it."""
+    apart = np.array([COMPONENT_SPREAD / 2, 0, 0, 0])
+    return theta - apart, theta + apart
 
 
 def _as_before(point, begin, chosen):
@@ -130,7 +138,8 @@ def _alone(fit, asked):
         views.append(replace(own, data=view.data - others))
     positions = begin.positions[begin.source[chosen]]
     sources = [ExtendedSource(position_px=tuple(map(float, p)), n_components=2) for p in positions]
-    return StartInput(fit.frame, sources, positions, views)
+    thetas = [_split(begin.thetas[i]) for i in chosen]
+    return StartInput(fit.frame, sources, positions, views, thetas)
 
 
 def _joined(begin, point, chosen):

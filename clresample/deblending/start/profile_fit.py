@@ -74,22 +74,41 @@ class ProfileFit:
         self._take(np.arange(len(self.theta)))
         self._measure_brightness(self.theta)  # now with spectra
 
-    def run(self):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways."""
+    def run(self, known=()):
+        """Steps until all scenes have ended; starts those with large galaxies in two ways.
+
+        known: {component: its parameters (n,) in an earlier fit}; scenes that have one go on from
+            there, and are not started a second time
+        """
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
+        going_on = self._go_on_from(dict(known))
         self._step(np.flatnonzero(some), learn=True)
-        scenes = self._with_large_galaxies()
+        scenes = np.setdiff1d(self._with_large_galaxies(), going_on)
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
         _run_from_wings(self, np.flatnonzero(some))
 
+    def _go_on_from(self, known):
+        """Sets known parameters {component: (n,)}; returns their scenes (k,), solved there."""
+        galaxies = [i for i in known if self.counts[i]]
+        for i in galaxies:
+            self.theta[self.looking.scene[i], self.looking.index[i], : self.counts[i]] = known[i]
+        scenes = np.unique(self.looking.scene[galaxies])
+        large = scenes[self._growth()[scenes] > MAX_GROWTH]
+        self.population.own_light[large] = OWN_LIGHT
+        self._take(scenes)
+        return scenes
+
+    def _growth(self):
+        """Largest excess (B,) of galaxies' ln sigma over the expected one."""
+        return ((self.theta - self.expected.mean)[..., 0] * self.expected.galaxies).max(axis=1)
+
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
-        growth = (self.theta - self.expected.mean)[..., 0] * self.expected.galaxies
         unexplained = self.chi2 > MAX_CHI2 * self.looking.n_pixels()
-        return np.flatnonzero((growth.max(axis=1) > MAX_GROWTH) | unexplained)
+        return np.flatnonzero((self._growth() > MAX_GROWTH) | unexplained)
 
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""

@@ -16,6 +16,7 @@ the profiles: with weights from the model, chi2 would decrease with the flux of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -44,12 +45,15 @@ class StartInput:
     """Inputs of the start of one scene.
 
     frame: Frame; sources (S), positions (S, 2) [px]: those inside it; views: WhitenedViews
+    thetas (S): for each source None, or the parameters (n,) of each of its components, from which
+        it starts; (): None for all
     """
 
     frame: Frame
     sources: list
     positions: np.ndarray
     views: list[WhitenedView]
+    thetas: tuple = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +117,7 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
     fit = ProfileFit(looking, noise)
     fit.begin()
     dark = _dark(patches, sources, looking)
-    fit.run()
+    fit.run(_known(patches, components))
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
@@ -200,6 +204,18 @@ def _components(patches):
                 sources.append(i)
                 n += 1
     return np.array(sources), components
+
+
+def _known(patches, components):
+    """Parameters {component: (n,)} of `StartInput.thetas`, of sources with as many components."""
+    known: dict[int, np.ndarray] = {}
+    numbers = range(len(components))
+    for (b, i), own in groupby(numbers, lambda k: (components[k].scene, components[k].source)):
+        places, before = list(own), (patches[b].thetas and patches[b].thetas[i]) or ()
+        sizes = [len(components[k].shape.mean) for k in places]
+        if [len(theta) for theta in before] == sizes:
+            known |= dict(zip(places, before, strict=True))
+    return known
 
 
 def _dark(patches, sources, looking):

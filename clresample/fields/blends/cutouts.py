@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...deblending.blend import Blend
@@ -15,7 +17,7 @@ from ...sky.sources import ExtendedSource, PointSource
 SIDE_PX = 4
 
 
-def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
+def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None):
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
     patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
@@ -23,14 +25,13 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None = their pixels are ignored, like those of
         all other blends
-    components: {id: number of components}; for other sources the data decide
 
     A patch that is covered by no mosaic gives a Blend without observations. Raises FileError for
     pixels that cannot be read.
     """
     grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
     foreign = _foreign(patch, labels, corner, neighbours is not None)
-    known, observations, boxes = components or {}, [], {}
+    observations, boxes = [], {}
     for mosaic in mosaics:
         box = fit_box(mosaic, grid)
         if not box.area:
@@ -49,21 +50,33 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
         if seen is not None:
             observations.append(seen)
             boxes[mosaic.name] = box
-    sources = tuple(listed_source(patch, plan, s, known) for s in patch.sources)
+    sources = tuple(listed_source(patch, plan, s) for s in patch.sources)
     frame = model_frame(observations, grid=grid) if observations else None
     return Blend(tuple(observations), sources, frame), boxes
 
 
-def listed_source(patch, plan, s, components):
-    """The source of index s of a plan in the patch's pixels, a free PointSource if it is a star.
-
-    components: {id: number of components} of galaxies
-    """
+def listed_source(patch, plan, s):
+    """The source of index s of a plan in the patch's pixels, a free PointSource if it is a star."""
     number = int(plan.ids[s])
     place = tuple(map(float, plan.positions[s] - patch.box[:2]))
     if number in plan.stars:
         return PointSource(position_px=place, name=str(number), free_position=True)
-    return ExtendedSource(position_px=place, name=str(number), n_components=components.get(number))
+    return ExtendedSource(position_px=place, name=str(number))
+
+
+def with_profiles(blend, profiles, *, single):
+    """A Blend whose sources go on from profiles {id: parameters (n,) of each component}.
+
+    Galaxies with several components keep their number; those with one get n_components=single.
+    """
+    sources, thetas = [], []
+    for source in blend.sources:
+        own = profiles.get(int(source.name), ())
+        if own and isinstance(source, ExtendedSource):
+            source = replace(source, n_components=len(own) if len(own) > 1 else single)
+        sources.append(source)
+        thetas.append(own)
+    return replace(blend, sources=tuple(sources), thetas=tuple(thetas))
 
 
 def fit_box(mosaic, grid) -> Box:

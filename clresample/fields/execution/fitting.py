@@ -23,7 +23,7 @@ from ...resampling.cache import default_cache
 from ...sky.box import Box
 from ...sky.grid import Grid
 from ...sky.sources import ExtendedSource
-from ..blends.cutouts import make_blend
+from ..blends.cutouts import make_blend, with_profiles
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
 from .group_results import GroupResults
@@ -96,10 +96,11 @@ class _BlendCutout:
     seconds: float
     more: tuple = ()
 
-    def joined(self, more):
-        """The same with more sources."""
+    def joined(self, more, profiles, *, single):
+        """The same with more sources, all of which go on from profiles, see `with_profiles`."""
         own = tuple(_source(self.patch, *row) for row in more)
         blend = replace(self.blend, sources=self.blend.sources + own)
+        blend = with_profiles(blend, profiles, single=single)
         return replace(self, blend=blend, more=(*self.more, *more))
 
 
@@ -133,7 +134,6 @@ def _fitted(job, group, given):
                 labels,
                 corner,
                 around,
-                dict(group.components),
             )
         except ERRORS as error:
             _set_aside(part, job, patch, group.round, _line(error))
@@ -142,7 +142,7 @@ def _fitted(job, group, given):
             _set_aside(part, job, patch, group.round, "no pixel here has a weight")
             continue
         cut = _BlendCutout(patch, blend, boxes, time.perf_counter() - start)
-        cuts.append(cut.joined(more))
+        cuts.append(cut.joined(more, dict(group.profiles), single=1))
     cuts, results = _fits_of(job, given, cuts, part, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
@@ -249,7 +249,10 @@ def _fits_of(job, given, cuts, part, n_round):
         is_piece = bool(cut.patch.siblings)
         if is_piece:
             part.found += [(cut.patch.number, *row) for row in rows]
-        return cut.joined(rows) if rows and not is_piece else None
+        if not rows or is_piece:
+            return None
+        names = (int(source.name) for source in result.sources)
+        return cut.joined(rows, dict(zip(names, result.thetas, strict=True)), single=None)
 
     if job.passes == 1 or n_round > 0:
         return cuts, fit(cuts)
@@ -309,9 +312,10 @@ def _take(part, job, cut, result, n_round):
         for i, (mosaic, box) in enumerate(_mosaics_of(job, cut.boxes))
     ]
     part.rows.append(rows)
-    for c in result.components:
+    thetas = [theta for own in result.thetas for theta in own]
+    for c, theta in zip(result.components, thetas, strict=True):
         spectrum = _all_channels(job, result.channels, c.spectrum)
-        part.add_component(ids[c.source], patch, origin + c.origin, c.morphology, spectrum)
+        part.add_component(ids[c.source], patch, origin + c.origin, c.morphology, spectrum, theta)
     for model in models:
         part.add_model(patch, *model)
     shifts = np.zeros((len(job.mosaics), 2))

@@ -18,7 +18,7 @@ class FitGroup:
         pieces
     neighbour_models: (patch, name of a file of results, weight) for each neighbour's model that is
         subtracted; the weights of a patch add up to 1
-    components: (id, number of components) of sources, as determined by an earlier round
+    profiles: (id, parameters (n,) of each component) of sources, as fitted in an earlier round
     found: (patch, id, y, x, id of the host) of sources that an earlier round detected in a patch's
         residuals, at (y, x) [px] of the field's model pixels
     """
@@ -27,7 +27,7 @@ class FitGroup:
     patches: tuple[int, ...]
     round: int = 0
     neighbour_models: tuple[tuple[int, str, float], ...] = ()
-    components: tuple[tuple[int, int], ...] = ()
+    profiles: tuple[tuple[int, tuple[tuple[float, ...], ...]], ...] = ()
     found: tuple[tuple[int, int, float, float, int], ...] = ()
 
 

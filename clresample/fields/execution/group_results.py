@@ -10,6 +10,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 
+from ...deblending.start.equations import N_PARAMETERS
 from ...files.fits import open_fits
 from ...measurement.columns import DEFINITIONS, Columns, definitions
 from ...sky.box import Box
@@ -44,7 +45,8 @@ class GroupResults:
 
     rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
     found: rows of FOUND_COLUMNS, sources in residuals, for the next round
-    components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
+    components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each; thetas:
+        (N_PARAMETERS,) of each, of its profile, padded with NaN
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
         shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
@@ -56,6 +58,7 @@ class GroupResults:
     found: list = field(default_factory=list)
     components: list = field(default_factory=list)
     spectra: list = field(default_factory=list)
+    thetas: list = field(default_factory=list)
     flat: list = field(default_factory=list)
     models: list = field(default_factory=list)
     pixels: list = field(default_factory=list)
@@ -64,11 +67,15 @@ class GroupResults:
     n_pixels: int = 0
     n_failed: int = 0
 
-    def add_component(self, source_id, patch, origin, morphology, spectrum):
-        """A component of a source: its box begins at `origin` (2,) of the field's model pixels."""
+    def add_component(self, source_id, patch, origin, morphology, spectrum, theta):
+        """A component of a source: its box begins at `origin` (2,) of the field's model pixels.
+
+        theta (n,): parameters of its profile
+        """
         where = (source_id, patch.parent, patch.number, *origin, *morphology.shape, self.n_flat)
         self.components.append(tuple(map(int, where)))
         self.spectra.append(spectrum)
+        self.thetas.append(np.pad(theta, (0, N_PARAMETERS - len(theta)), constant_values=np.nan))
         self.flat.append(np.ravel(morphology).astype(np.float32))
         self.n_flat += morphology.size
 
@@ -92,6 +99,7 @@ class GroupResults:
             _table(typed_rows(self.found, FOUND_COLUMNS), "FOUND"),
             _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
             _floats(self.spectra, "SPECTRA"),
+            _floats(self.thetas, "THETAS"),
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
             _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
             _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
@@ -146,6 +154,21 @@ class GroupResultsFile:
         with open_fits(self.path) as hdus:
             chosen = [hdus[name] for name in names]
             return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
+
+    def owners(self) -> list[tuple[int, int]]:
+        """(id of the source, patch) of each component."""
+        (table,) = self.read("COMPONENTS")
+        return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
+
+    def profiles(self, chosen) -> dict[int, tuple[tuple[float, ...], ...]]:
+        """Parameters {id: (n,) of each component} of the sources of the patches in `chosen`."""
+        found: dict[int, tuple] = {}
+        (thetas,) = self.read("THETAS")
+        for (source, patch), theta in zip(self.owners(), thetas, strict=True):
+            if patch in chosen:
+                own = tuple(theta[np.isfinite(theta)].tolist())
+                found[source] = (*found.get(source, ()), own)
+        return found
 
     def offsets(self) -> np.ndarray:
         """The rows of `GroupResults.offsets`."""

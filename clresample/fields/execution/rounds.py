@@ -71,7 +71,7 @@ def fit_all_groups(job, engine, progress):
                 patches,
                 n_round,
                 history.light_about(patches),
-                history.components_of(patches),
+                history.profiles_of(patches),
                 history.found_in(patches),
             )
             for i, patches in enumerate(groups)
@@ -140,16 +140,15 @@ class _PieceHistory:
         """`FitGroup.found` of some pieces: all that was found in their residuals so far."""
         return tuple(row for patch in patches for row in self.found.get(patch, ()))
 
-    def components_of(self, patches):
-        """`FitGroup.components` of some pieces, by their last fits.
+    def profiles_of(self, patches):
+        """`FitGroup.profiles` of some pieces, those of their last fits.
 
-        They are not tested again in each round, because a borderline source would alternate.
+        Numbers of components are not tested again in each round, because a borderline source would
+        alternate.
         """
-        found: dict[int, int] = {}
+        found: dict[int, tuple] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
-            for source, patch in _owners(_file(self.job, name)):
-                if patch in patches:
-                    found[source] = found.get(source, 0) + 1
+            found |= _file(self.job, name).profiles(patches)
         return tuple(sorted(found.items()))
 
     def moved(self, patches):
@@ -179,18 +178,12 @@ class _PieceHistory:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
             part = _file(self.job, name)
-            rows, where = part.read("CATALOGUE")[0], dict(_owners(part))
+            rows, where = part.read("CATALOGUE")[0], dict(part.owners())
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
                     found[source] = where[source], flux[k], error[k]
         return found
-
-
-def _owners(part):
-    """(id of the source, patch) of each component in a GroupResultsFile."""
-    (table,) = part.read("COMPONENTS")
-    return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
 
 
 def _columns(rows, kind, job):
