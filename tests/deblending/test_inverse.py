@@ -34,9 +34,9 @@ def whole(block):
     root, at = np.zeros((-(-m // n_rows) * n_rows,) * 2), 0
     for i in range(0, len(root), n_rows):
         size = n_rows * (i + n_rows)
-        root[i : i + n_rows, : i + n_rows] = block.factor[at : at + size].reshape(n_rows, -1)
+        root[i : i + n_rows, : i + n_rows] = block.cholesky[at : at + size].reshape(n_rows, -1)
         at += size
-    assert at == block.factor.size and not np.triu(root, 1).any()
+    assert at == block.cholesky.size and not np.triu(root, 1).any()
     return root[:m, :m].T @ root[:m, :m]
 
 
@@ -204,7 +204,7 @@ def test_a_large_source_has_the_direction_that_only_the_prior_constrains(monkeyp
     assert small.direction is None and len(small.blocks) == 1
     monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", 150)
     made = Made((26, 30), strengths)
-    d, curvature = made.made.blocks(strengths, SPECTRUM).direction.factor, made.curvature()
+    d, curvature = made.made.blocks(strengths, SPECTRUM).direction.values, made.curvature()
     assert d @ curvature @ d == pytest.approx(1, rel=0.02)
     by_prior = made.precision(slice(None)) * d @ d
     assert 0.9 < by_prior <= 1

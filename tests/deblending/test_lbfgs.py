@@ -264,8 +264,8 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
         """The value of each block on the device, if it is the same all over."""
         flat, out = m.b.device.get(shelf.values), []
         for block in blocks:
-            part = flat[shelf.first(block) :][: block.factor.size]
-            np.testing.assert_array_equal(part, block.factor)
+            part = flat[shelf.first(block) :][: block.cholesky.size]
+            np.testing.assert_array_equal(part, block.cholesky)
             out.append(part[0])
         return out
 
@@ -275,7 +275,7 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
     blocks[3] = made(20)
     uploads.clear()
     shelf.retain(blocks)
-    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].factor.size
+    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].cholesky.size
     assert shelf.values is before and held() == [1, 2, 3, 20, 5, 6, 7, 8]
     assert [shelf.first(b) for b in blocks[4:]] == first[4:]
     blocks = [made(k + 30) for k in range(8)]
