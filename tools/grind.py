@@ -45,6 +45,7 @@ from clresample.deblending.fit import Fit, start_fits  # noqa: E402
 from clresample.deblending.solver.boxes import Boxes  # noqa: E402
 from clresample.deblending.solver.buffers import SceneBuffers  # noqa: E402
 from clresample.deblending.solver.gradient import LossGradient  # noqa: E402
+from clresample.deblending.solver.multiscale import inverse  # noqa: E402
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine  # noqa: E402
 from clresample.device import tuning  # noqa: E402
 from clresample.device.program import Launcher  # noqa: E402
@@ -65,6 +66,8 @@ FAULTS = {
 }
 # Terms of the paper's contraction for a work-item: small models have few, and are cut all the same.
 CHUNK_TERMS = 32
+# Coefficients of a block of inverse curvature: small sources have several blocks with this.
+SMALL_BLOCK = 16
 # Loops of a work-item in a launch: few enough that a projection takes several.
 
 
@@ -117,7 +120,7 @@ def blends(n, profile=None, *, varying=False):
     Each blend is brighter than the one before: their fits end after different numbers of steps.
 
     profile: of the galaxies; None has one fitted, which takes most of a fit's time
-    varying: the first instrument's PSF widens along x
+    varying: the first instrument's PSF widens along x, and all channels are exposures of one band
     """
     rng = np.random.default_rng(5)
     grids = Grid.flat((10, 10), 0.1), Grid.flat((5, 6), 0.2, angle_deg=15)
@@ -132,7 +135,10 @@ def blends(n, profile=None, *, varying=False):
             weights = np.full(light.shape, 1e4)
             names = [f"{i}{band}" for band in range(psf.n_bands)]
             seen = FunctionPSF(_widening, 1) if varying and not i else psf
-            observations.append(Observation(light, seen, grid, weights=weights, channels=names))
+            given = {"weights": weights, "channels": names}
+            if varying:
+                given["bands"] = ["g"] * psf.n_bands
+            observations.append(Observation(light, seen, grid, **given))
         places = (4.5, 4.5), (3.0, 6.5)
         galaxies = [ExtendedSource(position_px=place, profile=profile) for place in places]
         sources = (*galaxies, PointSource(position_px=(6.5, 3.0)))
@@ -173,18 +179,20 @@ def _disc():
 
 
 def leave(device):
-    """One of two scenes goes on alone."""
-    settings = Settings(prior=MultiscalePrior())
+    """One of two scenes goes on alone, its sources in several blocks each."""
+    settings, most = Settings(prior=MultiscalePrior()), inverse.MAX_BLOCK_SIZE
+    inverse.MAX_BLOCK_SIZE = SMALL_BLOCK
     fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends(2, _disc())]
     start_fits(fits)
     scenes, states = [f.scene for f in fits], [f.state for f in fits]
     engine = MultiscaleEngine(scenes, states, device, np.float32, settings.prior, 1.0)
     engine.round()
     engine.subset([1]).round()
+    inverse.MAX_BLOCK_SIZE = most
 
 
 def vary(device):
-    """A fit with a PSF that varies over the blend."""
+    """A fit with a PSF that varies over the blend, to exposures of one band."""
     settings = PaperSettings(prior=SingleScalePrior(), max_iter=1)
     (result,) = deblend_many(blends(1, _disc(), varying=True), settings=settings, device=device)
     if result.status == "failed":

@@ -1,4 +1,4 @@
-"""Images on the device, uploaded once for as long as the host has them."""
+"""Arrays on the device, uploaded once for as long as the host has them."""
 
 from __future__ import annotations
 

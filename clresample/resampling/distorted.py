@@ -55,5 +55,6 @@ class DistortedExecutor(Executor):
 
     def pixels_to_frequencies(self, y: ImageBatch, n):
         """Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x];  y (n, P): I2"""
-        self.rowscale((self.whole_groups(self.k_pad * self.n_rows), n), y=y.buffer, y_offset=y.offset)
+        size = self.whole_groups(self.k_pad * self.n_rows), n
+        self.rowscale(size, y=y.buffer, y_offset=y.offset)
         self.from_rows(n)

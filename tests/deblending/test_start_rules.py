@@ -22,13 +22,14 @@ from clresample.deblending.start.component_batch import (
     StartComponent,
     boxes_of,
     cumulative_offsets,
+    listed_by_scene,
     peaks_of,
     profile_thresholds,
 )
 from clresample.deblending.start.equations import _eliminate
 from clresample.deblending.start.final_render import _ImageProfile
 from clresample.deblending.start.profile_start import LIGHT_SIGMAS, _is_dark, profile_peak
-from clresample.deblending.start.slot_observation import _listed, _pairs
+from clresample.deblending.start.slot_observation import _pairs
 from clresample.paper.solver.scene import UNSEEN
 from clresample.sky.sources import ExtendedSource, PointSource
 
@@ -208,11 +209,11 @@ def test_slots_of_equal_boxes_follow_each_other():
 
 
 def test_slots_are_listed_by_scene():
-    slots = SimpleNamespace(scene=np.array([2, 0, 2, 5, 0]))
-    scenes, first, listed = _listed(slots, [0, 2, 3])
+    slots = np.array([2, 0, 2, 5, 0])
+    scenes, first, listed = listed_by_scene(slots, [0, 2, 3])
     assert scenes.tolist() == [0, 2, 3] and first.tolist() == [0, 2, 4, 4]
     assert listed[:4].tolist() == [1, 4, 0, 2] and len(listed) == 5  # never empty
-    assert _listed(slots, [3])[2].tolist() == [0]
+    assert listed_by_scene(slots, [3])[2].tolist() == [0]
 
 
 def test_pairs_are_windows_of_one_scene_that_overlap_on_the_pixels():

@@ -134,6 +134,7 @@ class ComponentBatch:
         self.scene, self.n_images, self.slopes = scene[order], count[order], slopes
         self.origin, self.size = origin[order], size[order]
         self.begin, self.n_elements = cumulative_offsets(self.n_images * self.size.prod(axis=1))
+        self._lists = {}
 
     def __len__(self):
         return len(self.order)
@@ -144,6 +145,14 @@ class ComponentBatch:
         cuts = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
         return list(zip([0, *cuts.tolist()], [*cuts.tolist(), len(rows)], strict=True))
 
+    def lists(self, device, scenes):
+        """Arrays of `listed_by_scene` of scenes (k,) on the device, where they are put once."""
+        key = np.asarray(scenes).tobytes()
+        if key not in self._lists:
+            found = listed_by_scene(self.scene, scenes)
+            self._lists[key] = [device.put(array, np.int32) for array in found]
+        return self._lists[key]
+
     def draw(self, device, dtype, tuning, kept):
         """All images on the device, (n_elements,).
 
@@ -153,6 +162,8 @@ class ComponentBatch:
         smooth = _galaxies(self.components)
         if smooth.any():
             self._draw_galaxies(smooth, device, dtype, tuning, images)
+        runs: dict[int, list] = {}  # first element: images that follow each other
+        end = -1
         for i in np.flatnonzero(~smooth):
             c, theta = self.components[i], self.thetas[i]
             key = id(c), *self.origin[i], *self.size[i]
@@ -164,7 +175,11 @@ class ComponentBatch:
             if not len(theta):
                 kept[key] = cut
             begin = int(self.begin[i])
-            device.upload(cut, images[begin : begin + cut.size])
+            if begin != end:
+                first = begin
+            runs.setdefault(first, []).append(cut.ravel())
+            end = begin + cut.size
+        device.put_parts({begin: np.concatenate(run) for begin, run in runs.items()}, images)
         return images
 
     def _draw_galaxies(self, at, device, dtype, tuning, images):
@@ -198,6 +213,17 @@ def _shapes(theta, place, moment):
     norm = 1 / (2 * np.pi * np.sqrt(np.linalg.det(c)))
     head = [*place.T, inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1], np.exp(theta[:, 3])]
     return np.column_stack([*head, norm, by.reshape(len(theta), -1)])
+
+
+def listed_by_scene(of_slots, scenes):
+    """Scenes (k,), where each one's slots begin (k + 1,) in a list, and the list, not empty.
+
+    of_slots (slots,): the scene of each slot
+    """
+    by_scene = np.argsort(of_slots, kind="stable")
+    begin, end = (np.searchsorted(of_slots[by_scene], scenes, side) for side in ("left", "right"))
+    listed = [by_scene[a:b] for a, b in zip(begin, end, strict=True)]
+    return np.asarray(scenes), np.cumsum([0, *map(len, listed)]), np.concatenate([*listed, [0]])
 
 
 def cumulative_offsets(sizes):

@@ -103,9 +103,9 @@ class LinearisedScenes:
 
         chi2 (k,) of the rendered scenes, with the prior of the sky.
         """
-        spectra = self.spectra[self.at]
+        spectra, sky = self.spectra[self.at], self.sky.copy()
         self.sums = [
-            sight.compute_residuals(self.scenes, self.slots, spectra, self.sky, error)
+            sight.compute_residuals(self.scenes, self.slots, spectra, sky, error)
             for sight in self.sights
         ]
         of_sky = (self.sky_precision * self.sky**2)[self.scenes].sum(axis=1)
@@ -151,7 +151,7 @@ class LinearisedScenes:
 
         sky (B, C); error: part of the light that adds to the noise
         """
-        spectra = np.zeros((len(self.slots), self.n_channels))
+        spectra, sky = np.zeros((len(self.slots), self.n_channels)), np.array(sky)
         right, power = np.zeros((2, len(self.components), self.n_channels))
         for sight, (table, pairs) in zip(self.sights, self.overlapping_pairs, strict=True):
             sight.compute_residuals(self.scenes, self.slots, spectra, sky, error)

@@ -66,7 +66,9 @@ class BoxRenderer:
         fit = min(e.tuning.group_bytes // (n * self._n_bytes), MAX_GROUPS // (n * e.n_bands))
         group = min(count, max(1, fit))
         self._reserve(group * n)
-        phase = self.device.put(self._phases(which, moves), self.dtype)
+        phases = np.ascontiguousarray(self._phases(which, moves), self.dtype)
+        phase = self.device.empty(phases.shape, self.dtype)
+        self._sent = self.device.upload(phases, phase, wait=False)  # until the next call
         self._turn.bind(shares=phase if shares is None else self.device.put(shares, self.dtype))
         for first in range(0, count, group):
             m = min(group, count - first) * n

@@ -45,7 +45,7 @@ class SlotObservation:
         self.sky_precision = np.zeros(shape[:2]) if known[0] is None else np.array(known)
         self.aim = RenderPlanner(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
-        self._listed = None  # for the scenes of the last residuals, on the device
+        self._errors: dict = {}
 
     @cached_property
     def _light(self):
@@ -79,7 +79,6 @@ class SlotObservation:
         begin, n = cumulative_offsets(slots.n_images * self.n_bands * size.prod(axis=1))
         self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
         self.place_on_device = self.device.put(self.place.astype(np.int32))
-        self._listed = None
         self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
         for run in runs:
             at = int(slots.begin[run.first]), int(begin[run.first])
@@ -102,13 +101,15 @@ class SlotObservation:
 
         Also returns sums (k, Co, 3) over the pixels.
 
-        spectra (slots, C), sky (B, C): of the model; error: part of the light that adds to
-        the noise
+        spectra (slots, C), sky (B, C): of the model, uploaded once for all observations; error:
+        part of the light that adds to the noise
         """
-        put = self.device.put
-        if self._listed is None:
-            self._listed = [put(x.astype(np.int32)) for x in _listed(slots, scenes)]
-        scenes_on_device, first, listed = self._listed
+        scenes_on_device, first, listed = slots.lists(self.device, scenes)
+        if error not in self._errors:
+            self._errors[error] = self.device.put(error * self.scale, self.dtype)
+        spectra_on_device, sky = (
+            self.device.resident.stack([values], self.dtype) for values in (spectra, sky)
+        )
         group = self.tuning.sum_group
         self._launch(
             "compute_residuals",
@@ -120,9 +121,9 @@ class SlotObservation:
             place=self.place_on_device,
             channel=self.channels.start,
             n_channels=spectra.shape[1],
-            error=put(error * self.scale, self.dtype),
-            spectra=put(spectra, self.dtype),
-            sky=put(sky, self.dtype),
+            error=self._errors[error],
+            spectra=spectra_on_device,
+            sky=sky,
             root=self.root,
             data=self.data,
             light=self._light if error else self.data,  # times 0 without an error
@@ -197,16 +198,6 @@ def smoothed_light(view):
     return view.sqrt_weights * np.divide(
         light, seen, out=np.zeros_like(light), where=view.sqrt_weights > 0
     )
-
-
-def _listed(slots, scenes):
-    """Scenes (k,), where each one's slots begin (k + 1,) in a list, and the list, not empty."""
-    by_scene = np.argsort(slots.scene, kind="stable")
-    begin, end = (
-        np.searchsorted(slots.scene[by_scene], scenes, side) for side in ("left", "right")
-    )
-    listed = [by_scene[a:b] for a, b in zip(begin, end, strict=True)]
-    return np.asarray(scenes), np.cumsum([0, *map(len, listed)]), np.concatenate([*listed, [0]])
 
 
 def _pairs(scenes, lit, shape):

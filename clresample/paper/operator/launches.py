@@ -106,10 +106,11 @@ class PixelLaunches:
         spread: the adjoint for one chunk, part (1, n_l, ld) = pixels where covered, else 0
         """
         given = {"ld": ld, "part": part, "covered": self.covered, "n_cols": self.n_cols}
+        whole = -(-ld // self._group) * self._group
         collect, spread = (launcher().bind(**given, **self.steps) for launcher in self.launchers)
         return (
             functools.partial(
                 collect.bind(n_chunks=n_chunks, n_i=self.n_i), (self.n_i, self.n_l, n)
             ),
-            functools.partial(spread.bind(n_items=n, n_i=self.n_i), (-(-ld // self._group) * self._group, self.n_l)),
+            functools.partial(spread.bind(n_items=n, n_i=self.n_i), (whole, self.n_l)),
         )
