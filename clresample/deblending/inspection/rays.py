@@ -45,7 +45,10 @@ def without_rays(observations, frame) -> tuple:
 
 
 def _has_peak(image, c, place):
-    """Whether a channel of an InspectedImage has a peak at a place (2,) [px]; None if not seen."""
+    """Returns True if a channel of an InspectedImage has a peak at a place (2,) [px].
+
+    None if the place is not observed.
+    """
     reach = RING_FWHM[1] * image.width_px
     low = np.maximum(np.floor(place - reach).astype(int), 0)
     high = np.ceil(place + reach).astype(int) + 1
