@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.spectra import MODEL_ERROR
 from ..drawing.display import ShownDetection
@@ -89,8 +90,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     the images are searched one after the other, the sharpest first and then all together under
     filters of several widths. A peak within 0.7 FWHM of the image's PSF of an earlier source is
     the same source. Finally the sharpest image is searched without the symmetric light of these
-    sources. The light of stars with a saturated core is removed first. Needs `sep` (the extra
-    `detect`).
+    sources. Cosmic rays that one channel alone shows are masked and the light of stars with a
+    saturated core is removed first. Needs `sep` (the extra `detect`).
 
     observations: sequence of Observation, see `check_observations`, or of astropy's NDData and
         CCDData that have a PSF
@@ -107,7 +108,7 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     """
     observations = as_observations(observations)
     frame = model_frame(observations) if frame is None else frame
-    return _search(observations, frame, threshold, [], scatters)
+    return _search(without_rays(observations, frame), frame, threshold, [], scatters)
 
 
 def noise_scatter(observation, frame) -> np.ndarray:

@@ -29,7 +29,7 @@ def test_five_sigma_and_three_percent_in_any_channel_are_a_misfit():
     excess = np.where(residuals > 5, residuals, np.nan)  # as well
     found = Misfit(none, excess, none, light, *rest)
     assert found.sources().tolist() == [False, True, True, False, False, True]
-    around = np.array([4.99, 5.01, 9, 9, 0, 0]), np.array([9, 0.0301, 0.0299, 9, 9, 9])
+    around = np.array([3.99, 4.01, 9, 9, 0, 0]), np.array([9, 0.0301, 0.0299, 9, 9, 9])
     found = Misfit(none, none, none, light, *rest[:4], *around)
     assert found.sources().tolist() == [False, True, False, True, False, False]
 

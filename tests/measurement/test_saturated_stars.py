@@ -30,7 +30,7 @@ def moffat(y, x):
     return value * (BETA - 1) / (np.pi * radius**2)
 
 
-def starry(*, spikes=True, galaxy=True, seed=1):
+def starry(*, spikes=True, galaxy=True, seed=1, place=GALAXY, sigma_px=GALAXY_SIGMA):
     """An Observation of a saturated star with bleeds, masked, whose PSF image is a small one."""
     y, x = np.indices(SHAPE)
     dy, dx = y - STAR[0], x - STAR[1]
@@ -40,8 +40,8 @@ def starry(*, spikes=True, galaxy=True, seed=1):
         for a, b in ((along, across), (across, along)):
             data += 150 * np.exp(-np.abs(a) / 20 - 0.5 * (b / 1.7) ** 2)
     if galaxy:
-        s2 = GALAXY_SIGMA**2 + (FWHM / 2.3548) ** 2
-        away = (y - GALAXY[0]) ** 2 + (x - GALAXY[1]) ** 2
+        s2 = sigma_px**2 + (FWHM / 2.3548) ** 2
+        away = (y - place[0]) ** 2 + (x - place[1]) ** 2
         data += GALAXY_FLUX * np.exp(-away / (2 * s2)) / (2 * np.pi * s2)
     full = saturate(data, LEVEL)
     data += np.random.default_rng(seed).normal(0, NOISE, SHAPE)
@@ -155,3 +155,33 @@ def test_its_wings_and_spikes_are_its_own(fits, which):
     error = float(getattr(table["flux_err_r"][0], "value", table["flux_err_r"][0]))
     assert abs(flux - FLUX) < 2 * error  # of the PSF's width, by which the core follows from wings
     assert error < 0.2 * FLUX
+
+
+def test_the_wings_of_a_wide_galaxy_are_not_the_stars():
+    place = STAR[0] - 14.4, STAR[1] + 19.2
+    observation = starry(spikes=False, place=place, sigma_px=3.5)
+    listed = [ExtendedSource(position_px=at) for at in (STAR, place)]
+    table = catalogue(deblend([observation], listed))
+    flux = float(getattr(table["flux_r"][1], "value", table["flux_r"][1]))
+    assert flux == pytest.approx(GALAXY_FLUX, rel=0.06)
+
+
+def test_a_ray_of_one_band_is_no_source_and_a_star_of_both_is():
+    """Also where the light of the other band is that of a star's wings."""
+    rng, psf = (
+        np.random.default_rng(2),
+        PSF(moffat(np.arange(-12.0, 13.0)[:, None], np.arange(-12.0, 13))),
+    )
+    y, x = np.indices(SHAPE)
+    light = 3e4 * moffat(y - 40, x - 40)
+    data = light + rng.normal(0, NOISE, (2, *SHAPE))
+    data[0, 70, 20] += 600
+    data[0, 40, 52] += 600  # beside the star
+    given = {"psf": psf, "grid": Grid.flat(SHAPE, 0.26), "weights": NOISE**-2}
+    bands = [Observation(data, channels=("g", "r"), **given)]
+    alone = [
+        Observation(data[k : k + 1], channels=("gr"[k],), name="gr"[k], **given) for k in (0, 1)
+    ]
+    for some in (bands, alone):
+        assert [s.position_px for s in detect(some).sources] == [pytest.approx((40, 40), abs=1)]
+    assert len(detect(alone[:1]).sources) > 1  # nothing tells it from a source

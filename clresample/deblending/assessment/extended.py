@@ -22,11 +22,11 @@ from ..component_images import image_within, window_of
 WIDTH_FWHM = 1.0
 # [sigma of it] Margin about a point's image within which the blurred one is compared.
 MARGIN = 3.0
-# [sigma] from which a point source is flagged as misfitted: noise reaches it in one of 30,000, since
-# it is one test of each source.
+# [sigma] from which a point source is flagged as misfitted: noise reaches it in one of 30,000,
+# since it is one test of each source.
 WIDE_SIGMAS = 4.0
-# [sigma] from which errors hold the light that the point misses, of 2 in 100 true stars. Galaxies of
-# signal to noise 8 to 40 given as points were over 5 sigma off with no flag in 23 of 120 cases
+# [sigma] from which errors hold the light that the point misses, of 2 in 100 true stars. Galaxies
+# of signal to noise 8 to 40 given as points were over 5 sigma off with no flag in 23 of 120 cases
 # without it, and in 1 with it (cases of bench.ladder).
 DOUBTED_SIGMAS = 2.0
 
@@ -50,7 +50,7 @@ def extended_light(result, remainders) -> tuple[np.ndarray, np.ndarray]:
 
 
 def missed_light(result) -> np.ndarray:
-    """Fluxes (S, C) [counts] that point sources miss if they are galaxies, 0 where none shows it."""
+    """Fluxes (S, C) [counts] that point sources miss if they are galaxies, else 0."""
     flux = np.zeros((len(result.sources), len(result.channels)))
     for c in result.components:
         flux[c.source] += c.spectrum * c.morphology.sum()

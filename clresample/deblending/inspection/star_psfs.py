@@ -34,10 +34,13 @@ from .spoilt import GROW_PX
 from .star_cores import star_cores
 from .star_profile import RadialProfile
 
-# [FWHM of the PSF] Length of the medians along rays. The second one is used where the star's light
-# is over BRIGHT_STAR_SIGMAS, brighter than any source. Sources are narrower than half of the
-# length.
-LONG_MEDIAN_FWHM, SHORT_MEDIAN_FWHM, BRIGHT_STAR_SIGMAS = 8.0, 1.0, 100.0
+# [FWHM of the PSF] Length of the medians along rays, where the star's light is over so many sigma.
+# Unlisted sources are narrower than half of it, or fainter than such light.
+MEDIANS_FWHM = {-np.inf: 8.0, 30.0: 3.0, 100.0: 1.0}
+# [sigma], [distance from the star] Light of a listed source ends where the median of a ring around
+# it is fainter, or at this part of the distance. Galaxies of 9 px FWHM, 20 px from a star, had 0.5
+# to 0.8 of their flux when the star's PSF was measured on them too.
+LIGHT_SIGMAS, REACH_PART = 0.5, 0.5
 # Iterations in which the smoothed remainder is added, so that gradients are preserved.
 N_ROUNDS = 5
 # [FWHM of the PSF] Radius of a core from which a source listed as a galaxy is fitted as a star: no
@@ -45,6 +48,9 @@ N_ROUNDS = 5
 # the observation: light beside these falls too steeply for a profile. In `simulate field --sky
 # bright`, seed 2, the star's fluxes are 0.92 to 1.00 of the truth, with profiles 0.8 to 10.
 MIN_STAR_RADIUS_FWHM = 1.0
+# [px] Margin around such a core: chi2 of a real one is 1.10 to 1.29 in six exposures, 1.13 to 1.38
+# with one pixel less (bench.real, decam_star).
+WIDE_GROW_PX = 3
 # [px] Tolerance in the comparison of positions with those of stars, because of rounding.
 SAME_PLACE_PX = 0.5
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
@@ -85,8 +91,9 @@ class StarPSFs(PSFField):
 def with_star_psfs(image, sources, places, sky):
     """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
 
-    The masked pixels of all cores grow by `spoilt.GROW_PX`; stars with cores below
-    MIN_STAR_RADIUS_FWHM keep the PSF passed. Without any core the image is returned unchanged.
+    The masked pixels of all cores grow by WIDE_GROW_PX, or `spoilt.GROW_PX` for stars with cores
+    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed. Without any core the image is returned
+    unchanged.
 
     sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
     sky: True if a sky level is fitted
@@ -104,14 +111,15 @@ def with_star_psfs(image, sources, places, sky):
             if away.min() < max(core.radius, 1.0) and (
                 is_wide or isinstance(sources[i], PointSource)
             ):
+                grow = WIDE_GROW_PX if is_wide else GROW_PX
                 wide[c] |= image.usable[c] & binary_dilation(
-                    core.masked, np.ones((3, 3), bool), GROW_PX
+                    core.masked, np.ones((3, 3), bool), grow
                 )
                 if is_wide:
                     found.setdefault(i, {})[c] = core
     image = image.without(wide) if wide.any() else image
     found = {
-        i: {c: _measure_psf(image, c, image.places[i], core, sky) for c, core in cores.items()}
+        i: {c: _measure_psf(image, c, i, core, sky) for c, core in cores.items()}
         for i, cores in found.items()
     }
     found = {i: {c: p for c, p in own.items() if p is not None} for i, own in found.items()}
@@ -173,24 +181,29 @@ def _combine_psfs(given, own):
     return PSF.restore(images, spacing=given.spacing, center=centers)
 
 
-def _measure_psf(image, c, place, core, sky):
-    """Measures a star's own PSF in channel c: samples, their centre and the flux uncertainty.
+def _measure_psf(image, c, i, core, sky):
+    """Measures the own PSF of star i in channel c: samples, their centre, the flux uncertainty.
 
     The centre (2,) is in samples; for the uncertainty see StarPSFs. None if the star's light does
     not fall from the core outwards. The samples' sum is 1 less the light left out of the core.
-    place (2,) [px]: of the model's star; core: StarCore; sky: see `with_star_psfs`
+    i: number of the model's star; core: StarCore; sky: see `with_star_psfs`
     """
-    o, fwhm = image.observation, float(image.observation.psf.fwhm_px[c])
+    o, fwhm, place = image.observation, float(image.observation.psf.fwhm_px[c]), image.places[i]
     psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
     # the fit has no sky level, or a fitted one
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
-    radius = core.radius + GROW_PX
+    radius = core.radius + WIDE_GROW_PX
     away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])
     profile = RadialProfile.measure(data, image.usable[c] & (away >= radius), away, image.sigma[c])
     scale = profile and _scale(psf, c, profile, radius)
     if not scale:
         return None
-    rays, known = _rays(data - profile.at(away), image.usable[c], core.place, radius)
+    rest = data - profile.at(away)
+    others = np.delete(image.places, i, axis=0)[np.delete(image.inside, i)]
+    free = image.usable[c] & ~_near_sources(
+        rest / image.sigma[c], image.usable[c], others, core.place, fwhm
+    )
+    rays, known = _rays(rest, free, core.place, radius)
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, known, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image
@@ -212,6 +225,30 @@ def _measure_psf(image, c, place, core, sky):
     # the model's star lies at `place`, its light about the core's
     centre = np.array([-y[0], -x[0]]) / step + (place - core.place) / step
     return own / total, centre, abs(profile.power(radius) - 2)
+
+
+def _near_sources(rest, usable, places, star, fwhm):
+    """Selects the pixels (My, Mx) of the light of listed sources, which is not the star's.
+
+    Around each place, up to the ring where the median of the rest is below LIGHT_SIGMAS.
+    rest (My, Mx) [sigma]: data without the star's mean profile; places (S, 2), star (2,) [px]
+    """
+    found = np.zeros(rest.shape, bool)
+    for place in places:
+        end = max(fwhm, REACH_PART * np.hypot(*(place - star)))
+        low = np.maximum(np.floor(place - end).astype(int), 0)
+        high = np.ceil(place + end).astype(int) + 1
+        near = np.s_[low[0] : max(high[0], 0), low[1] : max(high[1], 0)]
+        away = np.hypot(*(np.indices(found[near].shape) + (low - place)[:, None, None]))
+        radius, light = fwhm, np.where(usable[near], rest[near], np.nan)
+        while radius < end:
+            ring = light[np.abs(away - radius) < 0.5]
+            ring = ring[np.isfinite(ring)]
+            if not ring.size or np.median(ring) < LIGHT_SIGMAS:
+                break
+            radius += 1.0
+        found[near] |= away < radius
+    return found
 
 
 def _rays(data, usable, place, radius):
@@ -253,11 +290,11 @@ def _lasting(rest, known, light, first, fwhm):
     """
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
-    long, short = (
-        median_filter(rest, (_odd(n * fwhm), 1), mode="nearest")
-        for n in (LONG_MEDIAN_FWHM, SHORT_MEDIAN_FWHM)
-    )
-    lasting = np.where(light[:, None] > BRIGHT_STAR_SIGMAS, short, long)[tuple(nearest)]
+    lasting = np.zeros_like(rest)
+    for least, length in MEDIANS_FWHM.items():
+        over = light > least
+        lasting[over] = median_filter(rest, (_odd(length * fwhm), 1), mode="nearest")[over]
+    lasting = lasting[tuple(nearest)]
     lasting[:first] = np.arange(first)[:, None] / max(first, 1) * lasting[first]
     return np.concatenate([lasting, lasting[:, :1]], axis=1)
 
