@@ -60,6 +60,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
+        self._started = np.zeros(size[0], bool)
         self.brightness, self.wings = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
@@ -74,24 +75,22 @@ class ProfileFit:
         self._take(np.arange(len(self.theta)))
         self._measure_brightness(self.theta)  # now with spectra
 
-    def run(self, known=()):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways.
-
-        known: {component: its parameters (n,) in an earlier fit}; scenes that have one go on from
-            there, and are not started a second time
-        """
+    def run(self):
+        """Steps until all scenes have ended; starts those with large galaxies in two ways."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        going_on = self._go_on_from(dict(known))
         self._step(np.flatnonzero(some), learn=True)
-        scenes = np.setdiff1d(self._with_large_galaxies(), going_on)
+        scenes = self._with_large_galaxies()
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
         _run_from_wings(self, np.flatnonzero(some))
 
-    def _go_on_from(self, known):
-        """Sets known parameters {component: (n,)}; returns their scenes (k,), solved there."""
+    def start_from(self, known):
+        """Sets the parameters of an earlier fit {component: (n,)}, and solves their scenes there.
+
+        These are not started a second time.
+        """
         galaxies = [i for i in known if self.counts[i]]
         for i in galaxies:
             self.theta[self.looking.scene[i], self.looking.index[i], : self.counts[i]] = known[i]
@@ -99,7 +98,7 @@ class ProfileFit:
         large = scenes[self._growth()[scenes] > MAX_GROWTH]
         self.population.own_light[large] = OWN_LIGHT
         self._take(scenes)
-        return scenes
+        self._started[scenes] = True
 
     def _growth(self):
         """Largest excess (B,) of galaxies' ln sigma over the expected one."""
@@ -108,7 +107,7 @@ class ProfileFit:
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
         unexplained = self.chi2 > MAX_CHI2 * self.looking.n_pixels()
-        return np.flatnonzero((self._growth() > MAX_GROWTH) | unexplained)
+        return np.flatnonzero(~self._started & ((self._growth() > MAX_GROWTH) | unexplained))
 
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
@@ -184,7 +183,13 @@ class ProfileFit:
             self._take_equations(scenes)
 
     def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
-        """Step until some scenes have ended; free (B, n): the components that move."""
+        """Step until some scenes have ended; free (B, n): the components that move.
+
+        learn: update the prior after each step, of each scene until that takes back what the step
+        gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
+        of the doubt at the end.
+        """
+        learning = np.full(len(self.theta), learn)
         live = np.isin(np.arange(len(self.theta)), scenes)
         damping = np.full(len(live), FIRST_DAMPING)
         free = np.ones(self.source.shape, bool) if free is None else free
@@ -194,7 +199,7 @@ class ProfileFit:
             scenes, step = scenes[expected >= CHI2_TOL], step[expected >= CHI2_TOL]
             live = np.isin(np.arange(len(live)), scenes)
             if not len(scenes):
-                return
+                break
             gain, trial = self._try(scenes, step)
             gained = gain > 0
             damping[scenes] = np.where(
@@ -206,11 +211,13 @@ class ProfileFit:
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
             if len(further) and i_step < n_steps - 1:
-                if learn:
-                    self._learn(further)
+                some = further[learning[further]]
+                learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
                 self._look(further, self.theta, slopes=True)
                 self.looking.compute_residuals(MODEL_ERROR)
                 self._take_equations(further)
+        if learn:
+            self._take(np.flatnonzero(~learning))
 
     def _next_step(self, scenes, damping, free):
         """Steps (k, n, 4) of some scenes, and the gain (k,) in chi2 expected of longer ones."""
@@ -246,11 +253,13 @@ class ProfileFit:
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
-        """Updates the prior of some scenes from the present parameters."""
+        """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
-        self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
+        increase = self.population.penalty(scenes, self.theta) - before
+        self.chi2[scenes] += increase
+        return increase
 
     def _doubt(self, scenes):
         """Stores the shape errors caused by neighbours, for some of the scenes solved last."""
