@@ -183,7 +183,6 @@ class Fit:
         )
         return with_errors(self, result, peaks, seen)
 
-
     def _thetas(self):
         """Parameters of the profiles, see Result."""
         found: list[tuple] = [()] * len(self.sources)

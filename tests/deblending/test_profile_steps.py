@@ -102,6 +102,24 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
     assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, 0]
 
 
+def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):
+    """Of that scene alone, whose doubt is made anew at the end."""
+    fit, looking = valley([4.0, 4.0])
+    learnt, taken = [], []
+
+    def learn(scenes):
+        learnt.append(scenes.tolist())
+        return np.where(scenes == 0, 1e6, -1.0)
+
+    monkeypatch.setattr(fit, "_learn", learn)
+    monkeypatch.setattr(fit, "_take", lambda scenes: taken.append(scenes.tolist()))
+    fit.run()
+    assert learnt[0] == [0, 1] and len(learnt) > 4
+    assert all(scenes == [1] for scenes in learnt[1:])
+    assert taken == [[0]]
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
+
+
 def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     """Equations that promise three times the way: 10 times more each time, then 3 times less."""
     fit, looking = valley([0.1], promise=3.0)

@@ -212,7 +212,8 @@ class ProfileFit:
             further = scenes[gained & live[scenes]]
             if len(further) and i_step < n_steps - 1:
                 some = further[learning[further]]
-                learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
+                if len(some):
+                    learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
                 self._look(further, self.theta, slopes=True)
                 self.looking.compute_residuals(MODEL_ERROR)
                 self._take_equations(further)
