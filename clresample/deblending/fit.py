@@ -88,7 +88,7 @@ class Fit:
         i = self.fitted
         thetas = self.blend.thetas or [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
-        return StartInput(self.frame, sources, self._positions[i], self.views, thetas)
+        return StartInput(self.frame, sources, self._positions[i], self.views, tuple(thetas))
 
     @property
     def signature(self):

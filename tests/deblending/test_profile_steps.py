@@ -94,7 +94,7 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
     monkeypatch.setattr(fit.expected, "galaxies", np.ones((3, 1), bool))
     monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: again.extend(scenes))
     before = looking.n_looks.copy()
-    fit.start_from({0: [1.8, 0, 0, 0]})
+    profile_fit.start_from(fit, {0: [1.8, 0, 0, 0]})
     fit.run()
     np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
     n_trials = looking.n_looks - before
