@@ -88,7 +88,7 @@ class Fit:
         i = self.fitted
         thetas = self.blend.thetas or [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
-        return StartInput(self.frame, sources, self._positions[i], self.views, thetas)
+        return StartInput(self.frame, sources, self._positions[i], self.views, tuple(thetas))
 
     @property
     def signature(self):
@@ -177,19 +177,11 @@ class Fit:
             shifts=self.shifts,
             losses=np.array(self.losses),
             status=self.status,
-            thetas=self._thetas(),
+            thetas=_thetas(self),
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
         return with_errors(self, result, peaks, seen)
-
-
-    def _thetas(self):
-        """Parameters of the profiles, see Result."""
-        found: list[tuple] = [()] * len(self.sources)
-        for i, theta in zip(self.fitted[self.start.source], self.start.thetas, strict=True):
-            found[i] += (theta,)
-        return tuple(found)
 
 
 def start_fits(fits):
@@ -259,6 +251,14 @@ def _inside(frame, positions):
         for i, p in enumerate(positions)
         if not inside[i]
     ]
+
+
+def _thetas(fit):
+    """Parameters of a fit's profiles, see Result."""
+    found: list[tuple] = [()] * len(fit.sources)
+    for i, theta in zip(fit.fitted[fit.start.source], fit.start.thetas, strict=True):
+        found[i] += (theta,)
+    return tuple(found)
 
 
 def _rendered(fit, seen):

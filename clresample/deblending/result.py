@@ -73,8 +73,8 @@ class Result(ResultDisplay):
         model does not describe the data, see `Misfit.is_wrong`), "iteration limit", "diverged" or
         "interrupted"
     thetas (S): of each source a tuple of its components' parameters (n,), of the smooth profiles
-        from which the fit began; another fit of these sources may start from them, see Blend. (): of
-        a result that was read
+        from which the fit began; another fit of these sources may start from them, see Blend. ():
+        of a result that was read
     messages: for the user, a line each; seconds: wall time by stage
     """
 

@@ -28,11 +28,11 @@ def ended(noise=(None, "correlated")):
         views.append(SimpleNamespace(covered=covered))
     fit = SimpleNamespace(
         blend=SimpleNamespace(observations=tuple(observations)),
-        frame="frame", geometry="home", sources=("a", "b"), views=views, unit=UNIT,
+        frame="frame", geometry="home", sources=tuple("abcdef"), views=views, unit=UNIT,
         sky_level=np.array([0.5, -0.25, 2.0]),
         padded=SimpleNamespace(shape=(24, 32)),
         fitted=np.array([3, 5]),
-        start=SimpleNamespace(source=np.array([1, 1, 0])),
+        start=SimpleNamespace(source=np.array([1, 1, 0]), thetas=["p", "q", "r"]),
         scene=SimpleNamespace(origin=np.array([(1, 2), (3, 4), (5, 6)])),
         state=SimpleNamespace(morph=morphs),
         shifts=np.array([(0, 0), (0.1, 0.2)]), losses=[3.0, 2.0], status="converged",
@@ -89,7 +89,8 @@ def test_results_are_in_counts_and_have_maxima_of_1(monkeypatch, bare):
         wanted = np.asarray(here if other is None else other) * view.covered
         np.testing.assert_array_equal(np.asarray(shown), wanted)
     assert (found.errors, found.status) == ("errors", "converged")
-    assert (found.frame, found.sources, found.messages) == ("frame", ("a", "b"), ("one",))
+    assert (found.frame, found.sources, found.messages) == ("frame", tuple("abcdef"), ("one",))
+    assert found.thetas == ((), (), (), ("r",), (), ("p", "q"))
     assert found.losses.tolist() == [3, 2] and found.shifts is fit.shifts
     assert found.observations is fit.blend.observations
     assert found.seconds["fit"] == 2 and 1 < found.seconds["result"] < 2

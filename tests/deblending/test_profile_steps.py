@@ -94,11 +94,30 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
     monkeypatch.setattr(fit.expected, "galaxies", np.ones((3, 1), bool))
     monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: again.extend(scenes))
     before = looking.n_looks.copy()
-    fit.run({0: [1.8, 0, 0, 0]})
+    profile_fit.start_from(fit, {0: [1.8, 0, 0, 0]})
+    fit.run()
     np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
     n_trials = looking.n_looks - before
     assert n_trials[0] < n_trials[1] and again == [1, 2]
     assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, 0]
+
+
+def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):
+    """Of that scene alone, whose doubt is made anew at the end."""
+    fit, looking = valley([4.0, 4.0])
+    learnt, taken = [], []
+
+    def learn(scenes):
+        learnt.append(scenes.tolist())
+        return np.where(scenes == 0, 1e6, -1.0)
+
+    monkeypatch.setattr(fit, "_learn", learn)
+    monkeypatch.setattr(fit, "_take", lambda scenes: taken.append(scenes.tolist()))
+    fit.run()
+    assert learnt[0] == [0, 1] and len(learnt) > 4
+    assert all(scenes == [1] for scenes in learnt[1:])
+    assert taken == [[0]]
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
 
 
 def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):

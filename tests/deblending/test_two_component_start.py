@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from clresample.deblending.component_images import ComponentImages
-from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
+from clresample.deblending.profiles import (
+    COMPONENT_SPREAD,
+    FixedProfile,
+    GalaxyProfile,
+    StarProfile,
+)
 from clresample.deblending.refit import two_component_start as second
 from clresample.deblending.refit.colour_gradient import GradientTest
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
@@ -26,7 +31,9 @@ def test_the_second_start_is_from_what_the_others_leave():
     rng, shape = np.random.default_rng(6), (5, 4)
     spectra, sky = rng.uniform(1, 2, (3, 3)), np.array([0.5, -0.25, 0.125])
     parts, views, observed = [slice(0, 1), slice(1, 3)], [], []
-    begin = SimpleNamespace(source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)))
+    begin = SimpleNamespace(
+        source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)), thetas=rng.random((3, 4))
+    )
     for part in parts:
         images = rng.random((3, part.stop - part.start, *shape))
         observed.append(ComponentImages(images.shape, np.zeros((3, 2), int), list(images)))
@@ -51,6 +58,9 @@ def test_the_second_start_is_from_what_the_others_leave():
     assert source.n_components == 2 and patch.frame == "home"
     np.testing.assert_array_equal(patch.positions, begin.positions[[2]])
     np.testing.assert_array_equal(source.position_px, begin.positions[2])
+    ((smaller, larger),) = patch.thetas
+    np.testing.assert_allclose(larger - smaller, [COMPONENT_SPREAD, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose((larger + smaller) / 2, begin.thetas[1])
     assert fit.state.spectra.all()  # the first fit's own stay
 
 
@@ -239,7 +249,10 @@ def test_the_other_start_takes_galaxies_over():
     shapes = [one, StarProfile.__new__(StarProfile), two, two, FixedProfile(np.ones((6, 7))), one]
     source = np.array([0, 1, 2, 2, 3, 4])
     drawn = np.random.default_rng(9).random((6, 7))
-    begin = SimpleNamespace(source=source, shapes=shapes, drawn=lambda i, low, size: drawn + i)
+    thetas = np.arange(24.0).reshape(6, 4)
+    begin = SimpleNamespace(
+        source=source, shapes=shapes, drawn=lambda i, low, size: drawn + i, thetas=list(thetas)
+    )
     place = {"position_px": (1.0, 2.0)}
     sources = [
         ExtendedSource(**place),
@@ -254,6 +267,8 @@ def test_the_other_start_takes_galaxies_over():
     assert found.sources[4].n_components == 2 and found.sources[4].profile is None
     np.testing.assert_array_equal(found.sources[0].profile, drawn)
     assert patch.sources[0].profile is None
+    np.testing.assert_array_equal(found.thetas[2], thetas[2:4])  # as the first fit had them
+    np.testing.assert_array_equal(np.mean(found.thetas[4], axis=0), thetas[5])
 
 
 def test_what_was_taken_over_has_its_first_shape_again():

@@ -17,6 +17,7 @@ from clresample.fields.execution.rounds import _PieceHistory
 from clresample.fields.execution.searching import _lost
 from clresample.paper.settings import PaperSettings
 from clresample.sky.box import Box
+from clresample.sky.sources import ExtendedSource
 
 
 def chain(saddle, n=4):
@@ -114,11 +115,18 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
 ):
     """A blend that is whole is fitted again at once; only the first round searches."""
     patch = SimpleNamespace(number=3, siblings=siblings, box=Box(10, 20, 40, 50), sources=(0,))
-    cut = fitting._BlendCutout(patch, fitting.Blend((), (), None), {}, 0.0)
+    known = ExtendedSource(position_px=(9, 9), name="76")
+    cut = fitting._BlendCutout(patch, fitting.Blend((), (known,), None), {}, 0.0)
     row, blends = (77, 15.0, 27.0, 5), []
     seen = SimpleNamespace(weights=np.ones((1, 10, 10)))
     good, bad = (
-        SimpleNamespace(observations=[seen], losses=[2, x], status=Ended.CONVERGED)
+        SimpleNamespace(
+            observations=[seen],
+            losses=[2, x],
+            status=Ended.CONVERGED,
+            sources=(known,),
+            thetas=(("its profile",),),
+        )
         for x in (4900.0, 5100.0)
     )
     monkeypatch.setattr(fitting, "_found", lambda *given: [row])
@@ -141,8 +149,9 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
         first[:] = [bad]
         assert fitting._fits_of(job, None, [cut], part, i)[0] == [cut]
         assert fitting._fits_of(SimpleNamespace(passes=1), None, [cut], part, i)[0] == [cut]
-    assert [b.sources[0].position_px for b in blends] == [(5.0, 7.0)] * fitted
-    assert [b.sources[0].name for b in blends] == ["77"] * fitted
+    assert [b.sources[1].position_px for b in blends] == [(5.0, 7.0)] * fitted
+    assert [[s.name for s in b.sources] for b in blends] == [["76", "77"]] * fitted
+    assert [b.thetas for b in blends] == [(("its profile",), ())] * fitted
 
 
 def test_what_was_found_is_carried_from_round_to_round(tmp_path):

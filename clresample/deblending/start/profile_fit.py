@@ -45,6 +45,7 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
+    started (B,): bool, scenes that go on from an earlier fit and are not started a second time
     wings (N, C): root mean square change of the spectra by the fit with other wings that did not
         stay, if both were as probable before the data; 0 where there was none
     """
@@ -60,6 +61,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
+        self.started = np.zeros(size[0], bool)
         self.brightness, self.wings = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
@@ -74,45 +76,20 @@ class ProfileFit:
         self._take(np.arange(len(self.theta)))
         self._measure_brightness(self.theta)  # now with spectra
 
-    def run(self, known=()):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways.
-
-        known: {component: its parameters (n,) in an earlier fit}; scenes that have one go on from
-            there, and are not started a second time
-        """
+    def run(self):
+        """Steps until all scenes have ended; starts those with large galaxies in two ways."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        going_on = self._go_on_from(dict(known))
         self._step(np.flatnonzero(some), learn=True)
-        scenes = np.setdiff1d(self._with_large_galaxies(), going_on)
+        scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
         _run_from_wings(self, np.flatnonzero(some))
 
-    def _go_on_from(self, known):
-        """Sets known parameters {component: (n,)}; returns their scenes (k,), solved there."""
-        galaxies = [i for i in known if self.counts[i]]
-        for i in galaxies:
-            self.theta[self.looking.scene[i], self.looking.index[i], : self.counts[i]] = known[i]
-        scenes = np.unique(self.looking.scene[galaxies])
-        large = scenes[self._growth()[scenes] > MAX_GROWTH]
-        self.population.own_light[large] = OWN_LIGHT
-        self._take(scenes)
-        return scenes
-
-    def _growth(self):
-        """Largest excess (B,) of galaxies' ln sigma over the expected one."""
-        return ((self.theta - self.expected.mean)[..., 0] * self.expected.galaxies).max(axis=1)
-
-    def _with_large_galaxies(self):
-        """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
-        unexplained = self.chi2 > MAX_CHI2 * self.looking.n_pixels()
-        return np.flatnonzero((self._growth() > MAX_GROWTH) | unexplained)
-
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
-        before, chi2 = self._copy(), self._chi2_as_expected(scenes)
+        before, chi2 = self._copy(), _chi2_as_expected(self, scenes)
         self.theta[scenes] = self.expected.mean[scenes]
         self.population.reset(scenes, self.expected)
         self.population.own_light[scenes] = OWN_LIGHT
@@ -121,12 +98,7 @@ class ProfileFit:
         first_profiles(self, scenes, MODEL_ERROR)
         self._take(scenes)
         self._step(scenes, learn=True)
-        self._restore(before, scenes[chi2 <= self._chi2_as_expected(scenes)])
-
-    def _chi2_as_expected(self, scenes):
-        """Chi2 (k,) with the priors as they were before any scene was fitted."""
-        learned = self.population.penalty(scenes, self.theta)
-        return self.chi2[scenes] - learned + self.expected.penalty(scenes, self.theta)
+        self._restore(before, scenes[chi2 <= _chi2_as_expected(self, scenes)])
 
     def _run_without_doubt(self, scenes):
         """Fits some scenes again without contamination of their shapes; the better fit stays.
@@ -184,7 +156,13 @@ class ProfileFit:
             self._take_equations(scenes)
 
     def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
-        """Step until some scenes have ended; free (B, n): the components that move."""
+        """Step until some scenes have ended; free (B, n): the components that move.
+
+        learn: update the prior after each step, of each scene until that takes back what the step
+        gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
+        of the doubt at the end.
+        """
+        learning = np.full(len(self.theta), learn)
         live = np.isin(np.arange(len(self.theta)), scenes)
         damping = np.full(len(live), FIRST_DAMPING)
         free = np.ones(self.source.shape, bool) if free is None else free
@@ -194,7 +172,7 @@ class ProfileFit:
             scenes, step = scenes[expected >= CHI2_TOL], step[expected >= CHI2_TOL]
             live = np.isin(np.arange(len(live)), scenes)
             if not len(scenes):
-                return
+                break
             gain, trial = self._try(scenes, step)
             gained = gain > 0
             damping[scenes] = np.where(
@@ -206,11 +184,14 @@ class ProfileFit:
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
             if len(further) and i_step < n_steps - 1:
-                if learn:
-                    self._learn(further)
+                some = further[learning[further]]
+                if len(some):
+                    learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
                 self._look(further, self.theta, slopes=True)
                 self.looking.compute_residuals(MODEL_ERROR)
                 self._take_equations(further)
+        if learn:
+            self._take(np.flatnonzero(~learning))
 
     def _next_step(self, scenes, damping, free):
         """Steps (k, n, 4) of some scenes, and the gain (k,) in chi2 expected of longer ones."""
@@ -246,11 +227,13 @@ class ProfileFit:
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
-        """Updates the prior of some scenes from the present parameters."""
+        """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
-        self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
+        increase = self.population.penalty(scenes, self.theta) - before
+        self.chi2[scenes] += increase
+        return increase
 
     def _doubt(self, scenes):
         """Stores the shape errors caused by neighbours, for some of the scenes solved last."""
@@ -273,6 +256,34 @@ class ProfileFit:
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
+
+
+def start_from(fit, known):
+    """Sets parameters of an earlier fit {component: (n,)} in a ProfileFit; solves their scenes."""
+    galaxies = [i for i in known if fit.counts[i]]
+    for i in galaxies:
+        fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
+    scenes = np.unique(fit.looking.scene[galaxies])
+    fit.population.own_light[scenes[_growth(fit)[scenes] > MAX_GROWTH]] = OWN_LIGHT
+    fit._take(scenes)
+    fit.started[scenes] = True
+
+
+def _growth(fit):
+    """Largest excess (B,) of galaxies' ln sigma over the expected one."""
+    return ((fit.theta - fit.expected.mean)[..., 0] * fit.expected.galaxies).max(axis=1)
+
+
+def _may_hold_large_galaxies(fit):
+    """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained."""
+    unexplained = fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()
+    return ~fit.started & ((_growth(fit) > MAX_GROWTH) | unexplained)
+
+
+def _chi2_as_expected(fit, scenes):
+    """Chi2 (k,) with the priors as they were before any scene was fitted."""
+    learned = fit.population.penalty(scenes, fit.theta)
+    return fit.chi2[scenes] - learned + fit.expected.penalty(scenes, fit.theta)
 
 
 def _run_from_wings(fit, scenes):

@@ -27,7 +27,7 @@ from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..view import WhitenedView, allow_for_psf_error, pixel_noise
 from .component_batch import StartComponent, renumbered
 from .linearised_scenes import linearise
-from .profile_fit import ProfileFit
+from .profile_fit import ProfileFit, start_from
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -117,7 +117,8 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
     fit = ProfileFit(looking, noise)
     fit.begin()
     dark = _dark(patches, sources, looking)
-    fit.run(_known(patches, components))
+    start_from(fit, _known(patches, components))
+    fit.run()
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
