@@ -69,7 +69,7 @@ def profile_grid(looking, scenes, thetas, error) -> dict:
 
 
 def first_profiles(fit, scenes, error):
-    """Sets the parameters of large galaxies in some scenes (k,) of a ProfileFit.
+    """Sets the parameters of large galaxies in some scenes (k,) of a ProfileFit; returns their set.
 
     fit: solved at its means in these scenes; error: part of the light that adds to the noise
     """
@@ -93,6 +93,7 @@ def first_profiles(fit, scenes, error):
             models = fit.fit_part(models, large, np.unique(looking.scene[list(new)]))
     for i in large:
         fit.theta[looking.scene[i], looking.index[i], : len(models[i])] = models[i]
+    return large
 
 
 def _next(looking, models, rest, error):

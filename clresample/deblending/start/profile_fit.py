@@ -10,12 +10,11 @@ from scipy.special import expit
 from ..spectra import MODEL_ERROR
 from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
-from .first_profiles import WIDE_WINGS, first_profiles
+from .first_profiles import NEED, WIDE_WINGS, first_profiles
 from .linearised_scenes import LinearisedScenes
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
+from .step_control import StepControl
 
-# Longest step of a parameter: the quadratic model of chi2 is not valid far from the minimum.
-LONGEST_STEP = 0.7
 # Largest number of steps, and the gain in chi2 below which they end, measured or expected.
 N_STEPS, CHI2_TOL = 40, 1.0
 # Largest number of steps after each large profile that is added, before all are fitted together.
@@ -31,10 +30,6 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # fluxes that differ by a third (bench.ladder, n = 4 at signal to noise 10 to 30); 5 and 20 give the
 # same results there.
 MAX_WINGS_LOSS = 20.0
-# Levenberg-Marquardt: damping of the first step relative to the normal matrix's diagonal, its
-# divisor after a successful step, its factor after a rejected one, and its largest value.
-FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
-
 
 class ProfileFit:
     """The least-squares problems of B scenes' parameters theta (B, n, 4), padded with zeros.
@@ -92,17 +87,22 @@ class ProfileFit:
         return np.flatnonzero((growth.max(axis=1) > MAX_GROWTH) | unexplained)
 
     def _run_from_large_galaxies(self, scenes):
-        """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
+        """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
+
+        Scenes in which no larger profile has more of the light keep the first fit.
+        """
         before, chi2 = self._copy(), self._chi2_as_expected(scenes)
         self.theta[scenes] = self.expected.mean[scenes]
         self.population.reset(scenes, self.expected)
         self.population.own_light[scenes] = OWN_LIGHT
         self._look(scenes, self.theta, slopes=False)
         self.looking.solve(MODEL_ERROR)
-        first_profiles(self, scenes, MODEL_ERROR)
-        self._take(scenes)
-        self._step(scenes, learn=True)
-        self._restore(before, scenes[chi2 <= self._chi2_as_expected(scenes)])
+        large = first_profiles(self, scenes, MODEL_ERROR)
+        again = np.isin(scenes, self.looking.scene[list(large)])
+        self._take(scenes[again])
+        self._step(scenes[again], learn=True)
+        better = again & (self._chi2_as_expected(scenes) < chi2)
+        self._restore(before, scenes[~better])
 
     def _chi2_as_expected(self, scenes):
         """Chi2 (k,) with the priors as they were before any scene was fitted."""
@@ -114,9 +114,15 @@ class ProfileFit:
 
         If one of two similar galaxies has the other one's light, that one's shape is contaminated.
         """
+        before = self._copy()
+        self.population.contamination[scenes] = 1
+        given = *self._equations(scenes), self.population.galaxies[scenes]
+        gain = StepControl(len(self.theta)).next(scenes, *given)[1]
+        self._restore(before, scenes[gain <= NEED])
+        scenes = scenes[gain > NEED]
         if len(scenes):
-            before = self._copy()
-            self._take(scenes, doubt=False)
+            penalty = (p.penalty(scenes, self.theta) for p in (self.population, before[3]))
+            self.chi2[scenes] += np.subtract(*penalty)
             self._step(scenes)
             self._take(scenes)
             self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
@@ -166,58 +172,42 @@ class ProfileFit:
 
     def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
         """Step until some scenes have ended; free (B, n): the components that move."""
+        steps = StepControl(len(self.theta))
         live = np.isin(np.arange(len(self.theta)), scenes)
-        damping = np.full(len(live), FIRST_DAMPING)
         free = np.ones(self.source.shape, bool) if free is None else free
         for i_step in range(n_steps):
             scenes = np.flatnonzero(live)
-            step, expected = self._next_step(scenes, damping[scenes], free[scenes])
-            scenes, step = scenes[expected >= CHI2_TOL], step[expected >= CHI2_TOL]
-            live = np.isin(np.arange(len(live)), scenes)
+            given = *self._equations(scenes), self.population.galaxies[scenes], free[scenes]
+            trial, expected, promised = steps.next(scenes, *given)
+            on = expected >= CHI2_TOL
+            live[scenes[~on]] = False
+            scenes = scenes[on]
             if not len(scenes):
                 return
-            gain, trial = self._try(scenes, step)
+            gain = self._try(scenes, trial[on])
             gained = gain > 0
-            damping[scenes] = np.where(
-                gained, damping[scenes] / DAMPING_DECREASE, damping[scenes] * DAMPING_INCREASE
-            )
-            enough = gained & (gain < CHI2_TOL)
-            live[scenes] = ~enough & (damping[scenes] <= MAX_DAMPING)
-            self.theta[scenes[gained]] = trial[scenes[gained]]
-            self._measure_brightness(self.theta)
+            live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & (gain < CHI2_TOL))
+            self._take_equations(scenes[gained])
             further = scenes[gained & live[scenes]]
-            if len(further) and i_step < n_steps - 1:
-                if learn:
-                    self._learn(further)
-                self._look(further, self.theta, slopes=True)
-                self.looking.compute_residuals(MODEL_ERROR)
-                self._take_equations(further)
+            if learn and len(further) and i_step < n_steps - 1:
+                self._learn(further)
 
-    def _next_step(self, scenes, damping, free):
-        """Steps (k, n, 4) of some scenes, and the gain (k,) in chi2 expected of longer ones."""
-        own, moves = np.eye(self.right.shape[1]), np.repeat(free, N_PARAMETERS, axis=1)
-        normal = self.normal[scenes] * (moves[:, None] & moves[..., None])
-        right = self.right[scenes] * moves
-        diagonal = np.diagonal(normal, axis1=1, axis2=2) * damping[:, None] + ~moves
-        step = np.linalg.solve(normal + diagonal[..., None] * own, right[..., None])
-        expected = (step * (2 * right[..., None] - normal @ step)).sum(axis=(1, 2))
-        step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-        return step.reshape(len(scenes), *self.theta.shape[1:]), expected
+    def _try(self, scenes, trial):
+        """Tries parameters (k, n, 4) of each of the scenes; the gains (k,).
 
-    def _try(self, scenes, step):
-        """Tries a step (k, n, 4) of each of the scenes.
-
-        Returns the gain (k,), spectra of the better state, and theta (B, n, 4) after it.
+        Keeps the better state of each.
         """
-        trial, before = self.theta.copy(), self.looking.kept_solution()
-        trial[scenes] += step
-        self._look(scenes, trial, slopes=False)
+        theta, before = self.theta.copy(), self.looking.kept_solution()
+        theta[scenes] = trial
+        self._look(scenes, theta, slopes=True)
         self.looking.solve(MODEL_ERROR)
-        new = self._chi2(scenes, trial)
+        new = self._chi2(scenes, theta)
         gain = self.chi2[scenes] - new
-        self.looking.restore(before, scenes[~(gain > 0)])
-        self.chi2[scenes] = np.where(gain > 0, new, self.chi2[scenes])
-        return gain, trial
+        better = gain > 0
+        self.looking.restore(before, scenes[~better])
+        self.chi2[scenes[better]], self.theta[scenes[better]] = new[better], trial[better]
+        self._measure_brightness(self.theta)
+        return gain
 
     def _look(self, scenes, theta, *, slopes):
         self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
@@ -229,7 +219,9 @@ class ProfileFit:
     def _learn(self, scenes):
         """Updates the prior of some scenes from the present parameters."""
         before = self.population.penalty(scenes, self.theta)
-        self.population.update(scenes, self.theta, self.normal)
+        normal = np.zeros_like(self.normal)
+        normal[scenes] = self._equations(scenes)[0]
+        self.population.update(scenes, self.theta, normal)
         self._doubt(scenes)
         self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
 
@@ -242,12 +234,18 @@ class ProfileFit:
         self.population.set_contamination(scenes, contamination_factors(*given))
 
     def _take_equations(self, scenes):
-        """Stores the normal equations of some scenes, priors included."""
+        """Stores the normal equations of some of the scenes rendered last."""
         normal, right = normal_equations(self.looking)
+        rows = self.looking.rows_of(scenes)
+        self.normal[scenes], self.right[scenes] = normal[rows], right[rows]
+
+    def _equations(self, scenes):
+        """Normal matrices and right sides of some scenes, priors included, and their parameters."""
+        right = self.right[scenes]
         weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
-        self.normal[scenes] = normal + weight[..., None] * np.eye(right.shape[1])
-        self.right[scenes] = right + weight * away.reshape(right.shape)
+        normal = self.normal[scenes] + weight[..., None] * np.eye(right.shape[1])
+        return normal, right + weight * away.reshape(right.shape), self.theta[scenes]
 
     def _measure_brightness(self, theta):
         """Stores the components' peaks over a model pixel's noise, in their best channel."""
