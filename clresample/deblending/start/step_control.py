@@ -36,10 +36,9 @@ class StepControl:
         normal (k, P, P), right (k, P): their equations; theta (k, n, 4); galaxies (k, n): those with
             wings; free (k, n): the components that move, None for all
         """
-        beta = np.exp(theta[..., 3])
-        scale = np.log1p(1 / beta)
+        scale, per_scale = wings_scale(theta)
         most = np.full(theta.shape, np.inf)
-        most[..., 3] = np.where(galaxies, MOST_OF_WINGS * scale * (1 + beta), np.inf)
+        most[..., 3] = np.where(galaxies, MOST_OF_WINGS * scale * per_scale, np.inf)
         most, moves = most.reshape(right.shape), np.ones(right.shape, bool)
         if free is not None:
             moves = np.repeat(free, N_PARAMETERS, axis=1)
@@ -49,9 +48,9 @@ class StepControl:
         step = np.clip(whole, -longest, longest)
         self._length[scenes] = np.abs(step).max(axis=(1, 2))
         trial = theta + step
-        wings = -np.log(np.expm1(scale - step[..., 3] / (1 + beta)))
+        wings = -np.log(np.expm1(scale - step[..., 3] / per_scale))
         trial[..., 3] = np.where(galaxies, wings, trial[..., 3])
-        gains = [_gain(normal, right, s.reshape(right.shape)) for s in (whole, step)]
+        gains = [gain_of(normal, right, s.reshape(right.shape)) for s in (whole, step)]
         return trial, *gains
 
     def take(self, scenes, gain, promised):
@@ -81,6 +80,15 @@ def _bounded(normal, right, damping, moves, most):
     return np.minimum(step, most)
 
 
-def _gain(normal, right, step):
-    """Fall (k,) of chi2 by steps (k, P), to second order."""
+def wings_scale(theta):
+    """ln(1 + 1 / beta) (k, n) of parameters (k, n, 4), and the fall of ln beta by 1 of it.
+
+    Profiles are nearly linear in it: it is 1 / beta near a Gaussian, -ln beta of wide wings.
+    """
+    beta = np.exp(theta[..., 3])
+    return np.log1p(1 / beta), 1 + beta
+
+
+def gain_of(normal, right, step):
+    """Fall (k,) of chi2 by steps (k, P), to second order, from equations as of StepControl."""
     return 2 * (step * right).sum(axis=1) - np.einsum("ki,kij,kj->k", step, normal, step)
