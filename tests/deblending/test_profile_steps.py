@@ -94,7 +94,7 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
 def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     """Equations that promise three times the way: the next trial is a shorter one."""
     fit, looking = valley([0.1], promise=3.0)
-    gains, real, damped = [], fit._try, []
+    gains, real = [], fit._try
 
     def tried(scenes, trial):
         gain = real(scenes, trial)

@@ -19,11 +19,10 @@ from .step_control import StepControl, gain_of, wings_scale
 N_STEPS, CHI2_TOL = 40, 1.0
 # Largest number of steps after each large profile that is added, before all are fitted together.
 N_FIRST_STEPS = 5
-# A scene is started again, from profiles of large galaxies, if a galaxy became larger than expected
-# by this in ln sigma, or if chi2 per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0)
-# none of parametric galaxies is beyond 0.74 and 1.06, but six of real COSMOS galaxies are, and the
-# start of all takes 1.7 times as long. Second starts that differed from first ones were all of
-# scenes beyond 1.1 (bench.ladder, seed 5).
+# A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
+# per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
+# beyond 0.74 and 1.06, but six of real COSMOS galaxies are, of which one has a second start. Second
+# starts that differed from first ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
 MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # A galaxy has grown by itself if it is larger than expected by this in ln sigma, half of a step of
 # the grid of sizes. Of 30 scenes with large galaxies (bench.ladder, seed 77) second starts gained
@@ -38,6 +37,7 @@ MAX_WINGS_LOSS = 20.0
 # scenes (bench.ladder, seed 99, and COSMOS galaxies) they predict 0.7 to 4 times the rise where it
 # is below 100, and at most 54 where it is below 20.
 DOUBT_OF_LOSS = 20.0
+
 
 class ProfileFit:
     """The least-squares problems of B scenes' parameters theta (B, n, 4), padded with zeros.

@@ -33,8 +33,8 @@ class StepControl:
 
         Also the gains (k,) in chi2 that are expected of whole steps and of those that are taken.
 
-        normal (k, P, P), right (k, P): their equations; theta (k, n, 4); galaxies (k, n): those with
-            wings; free (k, n): the components that move, None for all
+        normal (k, P, P), right (k, P), theta (k, n, 4): their equations and parameters; galaxies
+            (k, n): those with wings; free (k, n): the components that move, None for all
         """
         scale, per_scale = wings_scale(theta)
         most = np.full(theta.shape, np.inf)
@@ -54,7 +54,7 @@ class StepControl:
         return trial, *gains
 
     def take(self, scenes, gain, promised):
-        """Takes over the gains (k,) of a trial; tells which scenes (k,) may have another one."""
+        """Adapts to the gains (k,) of a trial; selects the scenes (k,) that may have another."""
         as_promised = gain > PROMISED * promised
         factor = np.where(as_promised, 1 / DAMPING_DECREASE, DAMPING_DECREASE)
         factor = np.where(gain > 0, factor, DAMPING_INCREASE)
