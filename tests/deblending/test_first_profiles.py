@@ -31,8 +31,9 @@ def sized(device, monkeypatch):
 
         def noted(fit, scenes, error):
             kept.append(np.array([theta[0] for theta in fit.thetas()]))
-            instead(fit, scenes, error)
+            large = instead(fit, scenes, error)
             kept.append(np.array([theta[0] for theta in fit.thetas()]))
+            return large
 
         monkeypatch.setattr(profile_fit, "first_profiles", noted)
         one = Fit(blend(objects, shape=(96, 96), seed=5), Settings(), device, np.float32, pad=1)
@@ -71,6 +72,7 @@ def test_small_galaxies_are_started_once(sized):
 def spoilt(fit, scenes, _error):
     """Sets sizes from which least squares do not return in place of those of the grid."""
     fit.theta[scenes, :, 0] = np.log(1e6 * GIANT[2])
+    return np.ones(fit.source.shape, bool)
 
 
 def test_of_two_starts_the_better_fit_stays(sized):
@@ -78,6 +80,36 @@ def test_of_two_starts_the_better_fit_stays(sized):
     *_, found = sized([*SMALL[:2], GIANT], spoilt)
     assert found[2] == pytest.approx(np.log(GIANT[2]), abs=0.1)
     assert (found[:2] < np.log(1.5 * GROWTH)).all()
+
+
+def test_a_fit_that_found_the_large_galaxy_goes_on(sized, monkeypatch):
+    """One that has grown in the first fit is the grid's: its size there stays, the grid's is none.
+
+    Where the grid has no large one, nothing is fitted again.
+    """
+
+    def alike(fit, scenes, _error):
+        fit.theta[scenes, 0, 0] = np.log(1e6 * GIANT[2])
+        return np.isin(fit.source, [0])
+
+    def none(fit, scenes, error):
+        alike(fit, scenes, error)
+        return np.zeros(fit.source.shape, bool)
+
+    for instead in (alike, none):
+        *_, found = sized([GIANT, ((20.0, 24.0), (900, 800, 700), 2.0)], instead)
+        assert found[0] == pytest.approx(np.log(GIANT[2]), abs=0.05)
+    trials = []
+    real = profile_fit.ProfileFit._try
+    monkeypatch.setattr(
+        profile_fit.ProfileFit, "_try", lambda *a: trials.append(len(a[1])) or real(*a)
+    )
+    counts = []
+    for instead in (first_profiles, alike, none):
+        trials.clear()
+        sized([GIANT, ((20.0, 24.0), (900, 800, 700), 2.0)], instead)
+        counts.append(len(trials))
+    assert counts[2] <= counts[1] < counts[0] + 3
 
 
 def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
@@ -90,7 +122,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
         measured.append((kept, fit.chi2[scenes]))
 
     monkeypatch.setattr(profile_fit.ProfileFit, "_run_without_doubt", noted)
-    sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0)], spoilt)
+    sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0), SMALL[0]], spoilt)
     ((kept, again),) = measured
     assert len(kept)
     np.testing.assert_allclose(kept, again, rtol=1e-5)

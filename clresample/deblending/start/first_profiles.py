@@ -69,7 +69,9 @@ def profile_grid(looking, scenes, thetas, error) -> dict:
 
 
 def first_profiles(fit, scenes, error):
-    """Sets the parameters of large galaxies in some scenes (k,) of a ProfileFit.
+    """Sets the parameters of large galaxies in some scenes (k,) of a ProfileFit, and selects them.
+
+    They are bool (B, n), of all scenes and their components.
 
     fit: solved at its means in these scenes; error: part of the light that adds to the noise
     """
@@ -91,8 +93,11 @@ def first_profiles(fit, scenes, error):
         large |= new
         if new:
             models = fit.fit_part(models, large, np.unique(looking.scene[list(new)]))
+    found = np.zeros(fit.source.shape, bool)
     for i in large:
-        fit.theta[looking.scene[i], looking.index[i], : len(models[i])] = models[i]
+        at = looking.scene[i], looking.index[i]
+        fit.theta[*at, : len(models[i])], found[at] = models[i], True
+    return found
 
 
 def _next(looking, models, rest, error):
