@@ -1,5 +1,6 @@
 """Whole runs over a small field: what they leave, interrupted, in tiles, cut, with bad files."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -214,6 +215,20 @@ def test_later_rounds_keep_the_components_and_go_on_from_their_profiles(cut):
     first, later = ([own for own in cut[1] if own[0] == k] for k in (False, True))
     assert first and all(set(ns) == {None} and not any(known) for _, ns, known in first)
     assert later and all(ns == known and 0 not in known for _, ns, known in later)
+
+
+def test_rounds_that_are_resumed_end_with_the_same_bytes(cut, done, sky, tmp_path):
+    """They go on from the profiles in the files of the round before."""
+    folder = shutil.copytree(cut[0], tmp_path / "again")
+    later = sorted((folder / "work").glob("fit-[1-9]*.fits"))
+    assert later
+    for path in later:
+        path.unlink()
+    largest = int(table(done[0])["n_blend_sources"].max())
+    options = FieldOptions(limits=FitLimits(max_sources=largest - 1))
+    run_field(mosaics_of(sky), folder, options=options, resume=True)
+    for name in ("catalogue.fits", "models.fits", "residual_Euclid.fits"):
+        assert (folder / name).read_bytes() == (cut[0] / name).read_bytes(), name
 
 
 def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, tmp_path):
