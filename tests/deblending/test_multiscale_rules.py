@@ -115,13 +115,21 @@ def test_a_fit_has_converged_when_five_iterations_gain_too_little(total, ends, c
 
 
 @pytest.mark.parametrize(
-    "before, now, ends",
-    [(0.12, 0.09, True), (0.11, 0.09, False), (0.00095, 0.0009, True), (5.0, 0.11, False)],
+    "before, now, n_rounds, ends",
+    [
+        (0.2, 0.03, 49, True),
+        (0.2, 0.05, 49, False),
+        (0.12, 0.09, 50, True),
+        (0.11, 0.09, 50, False),
+        (0.00095, 0.0009, 49, True),
+        (5.0, 0.11, 50, False),
+    ],
 )
-def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(before, now, ends):
+def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(before, now, n_rounds, ends):
     """Falls in each of ten iterations, loss_tol 0.5: 5 now, 25 now^2 / (5 before - 5 now) later,
-    which may be four times that; none below a hundredth of loss_tol counts."""
+    which may be a tenth of it, or four times that late; none below a hundredth of it counts."""
     control = begun(10)
+    control.n_rounds[:] = n_rounds
     control._losses[0, ::-1] = 10 + np.cumsum([0, *[-before] * 5, *[-now] * 5])
     control.next_actions(np.array([True]))
     assert control.converged.tolist() == [ends]
