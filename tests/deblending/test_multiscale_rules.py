@@ -115,14 +115,27 @@ def test_a_fit_has_converged_when_five_iterations_gain_too_little(total, ends, c
 
 
 @pytest.mark.parametrize(
-    "before, now, ends",
-    [(0.2, 0.03, True), (0.2, 0.05, False), (0.00095, 0.0009, True), (5.0, 0.11, False)],
+    "n, before, now, n_rounds, refused, ends",
+    [
+        (5, 0.2, 0.03, 49, 0, True),
+        (5, 0.2, 0.05, 49, 0, False),
+        (10, 0.14, 0.06, 50, 40, True),
+        (10, 0.14, 0.06, 50, 41, False),
+        (10, 0.14, 0.06, 49, 0, False),
+        (10, 0.13, 0.06, 50, 0, False),
+        (10, 5.0, 0.11, 50, 0, False),
+        (5, 0.00095, 0.0009, 49, 0, True),
+        (5, 5.0, 0.11, 50, 0, False),
+    ],
 )
-def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(before, now, ends):
-    """Falls in each of ten iterations, loss_tol 0.5: 5 now, 25 now^2 / (5 before - 5 now) later,
-    which may be a tenth of it; none below a hundredth of loss_tol counts."""
+def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(
+    n, before, now, n_rounds, refused, ends
+):
+    """Falls in each of 2n iterations, loss_tol 0.5: n now, n now^2 / (before - now) later, which
+    may be a tenth of it, or all of it late; none below a hundredth of it counts."""
     control = begun(10)
-    control._losses[0, ::-1] = 10 + np.cumsum([0, *[-before] * 5, *[-now] * 5])
+    control.n_rounds[:], control._refused[:] = n_rounds, refused
+    control._losses[0, 2 * n :: -1] = 10 + np.cumsum([0, *[-before] * n, *[-now] * n])
     control.next_actions(np.array([True]))
     assert control.converged.tolist() == [ends]
 
