@@ -41,7 +41,7 @@ def profile_fit_of(device, catalogue, observations, *, precision=None, **given):
 
 
 def test_slopes_of_chi2(device, monkeypatch):
-    """By shapes and a star's place, the spectra and the sky following: minus twice the right side."""
+    """By shapes and a star's place, the spectra and the sky following: -2 of the right side."""
     monkeypatch.setattr(profile_fit, "MODEL_ERROR", 0.0)  # weights that stay
     catalogue = (*sources(), PointSource(position_px=(8, 28), free_position=True))
     objects = (*GALAXIES, ((8.3, 27.8), FLUX, 0))
