@@ -121,7 +121,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
         fit._take(scenes)
         measured.append((kept, fit.chi2[scenes]))
 
-    monkeypatch.setattr(profile_fit.ProfileFit, "_run_without_doubt", noted)
+    monkeypatch.setattr(profile_fit, "_run_without_doubt", noted)
     sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0), SMALL[0]], spoilt)
     ((kept, again),) = measured
     assert len(kept)

@@ -87,7 +87,7 @@ class ProfileFit:
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
-            self._run_without_doubt(scenes[doubted])
+            _run_without_doubt(self, scenes[doubted])
         _run_from_wings(self, np.flatnonzero(some))
 
     def _run_from_large_galaxies(self, scenes):
@@ -111,7 +111,8 @@ class ProfileFit:
         self._step(scenes[some], learn=True)
         better = some & (_chi2_as_expected(self, scenes) < chi2)
         self._restore(before, scenes[~better])
-        self._look_again(scenes[some & ~better])
+        self.population.own_light[scenes[some]] = OWN_LIGHT
+        self._take(scenes[some & ~better])
 
     def _look_again(self, scenes):
         """Stores the equations of some scenes at parameters and spectra set from outside."""
@@ -119,26 +120,6 @@ class ProfileFit:
             self._look(scenes, self.theta, slopes=True)
             self.looking.compute_residuals(MODEL_ERROR)
             self._take_equations(scenes)
-
-    def _run_without_doubt(self, scenes):
-        """Fits some scenes again without contamination of their shapes; the better fit stays.
-
-        If one of two similar galaxies has the other one's light, that one's shape is contaminated.
-        """
-        before = self._copy()
-        self.population.contamination[scenes] = 1
-        given = *self._equations(scenes), self.population.galaxies[scenes]
-        gain = StepControl(len(self.theta)).next(scenes, *given)[1]
-        self._restore(before, scenes[gain <= NEED])
-        scenes = scenes[gain > NEED]
-        if len(scenes):
-            penalty = (p.penalty(scenes, self.theta) for p in (self.population, before[3]))
-            self.chi2[scenes] += np.subtract(*penalty)
-            self._step(scenes)
-            self._take(scenes)
-            worse = scenes[before[0][scenes] <= self.chi2[scenes]]
-            self._restore(before, worse)
-            self._look_again(worse)
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
@@ -305,6 +286,28 @@ def _chi2_as_expected(fit, scenes):
     """Chi2 (k,) with the priors as they were before any scene was fitted."""
     learned = fit.population.penalty(scenes, fit.theta)
     return fit.chi2[scenes] - learned + fit.expected.penalty(scenes, fit.theta)
+
+
+def _run_without_doubt(fit, scenes):
+    """Fits scenes of a ProfileFit again without contamination of their shapes.
+
+    The better fit stays. If one of two similar galaxies has the other one's light, that one's shape
+    is contaminated.
+    """
+    before = fit._copy()
+    fit.population.contamination[scenes] = 1
+    given = *fit._equations(scenes), fit.population.galaxies[scenes]
+    gain = StepControl(len(fit.theta)).next(scenes, *given)[1]
+    fit._restore(before, scenes[gain <= NEED])
+    scenes = scenes[gain > NEED]
+    if len(scenes):
+        penalty = (p.penalty(scenes, fit.theta) for p in (fit.population, before[3]))
+        fit.chi2[scenes] += np.subtract(*penalty)
+        fit._step(scenes)
+        fit._take(scenes)
+        worse = scenes[before[0][scenes] <= fit.chi2[scenes]]
+        fit._restore(before, worse)
+        fit._look_again(worse)
 
 
 def _run_from_wings(fit, scenes):
