@@ -5,14 +5,14 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
-from scipy.special import expit
 
 from ..spectra import MODEL_ERROR
 from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
-from .first_profiles import WIDE_WINGS, first_profiles
+from .first_profiles import first_profiles
 from .linearised_scenes import LinearisedScenes
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
+from .shape_grid import fit_faint_shapes
 
 # Longest step of a parameter: the quadratic model of chi2 is not valid far from the minimum.
 LONGEST_STEP = 0.7
@@ -26,11 +26,6 @@ N_FIRST_STEPS = 5
 # start of all takes 1.7 times as long. Second starts that differed from first ones were all of
 # scenes beyond 1.1 (bench.ladder, seed 5).
 MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
-# A scene is fitted once more from wide wings if these alone, with all else as fitted, raise chi2 by
-# less than this. Chi2 of faint galaxies with the prior has two minima, with and without wings, of
-# fluxes that differ by a third (bench.ladder, n = 4 at signal to noise 10 to 30); 5 and 20 give the
-# same results there.
-MAX_WINGS_LOSS = 20.0
 # Levenberg-Marquardt: damping of the first step relative to the normal matrix's diagonal, its
 # divisor after a successful step, its factor after a rejected one, and its largest value.
 FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
@@ -45,8 +40,8 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
-    wings (N, C): root mean square change of the spectra by the fit with other wings that did not
-        stay, if both were as probable before the data; 0 where there was none
+    flux_scatter (N, C): of the spectra by size and wings, of faint galaxies, see shape_grid.py; 0
+        for others
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -60,7 +55,8 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness, self.wings = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
+        self.brightness = np.zeros(len(shapes))
+        self.flux_scatter = np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -83,7 +79,7 @@ class ProfileFit:
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             self._run_without_doubt(scenes[doubted])
-        _run_from_wings(self, np.flatnonzero(some))
+        fit_faint_shapes(self, np.flatnonzero(some))
 
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
@@ -254,44 +250,3 @@ class ProfileFit:
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
-
-
-def _run_from_wings(fit, scenes):
-    """Fits scenes of a ProfileFit again from wide wings if the data may have them.
-
-    The better fit stays.
-    """
-    compact = fit.population.galaxies & (fit.theta[..., 3] > np.log(WIDE_WINGS))
-    scenes = scenes[compact[scenes].any(axis=1)]
-    if not len(scenes):
-        return
-    before, theta = fit._copy(), fit.theta.copy()
-    theta[compact, 3] = np.log(WIDE_WINGS)
-    fit._look(scenes, theta, slopes=False)
-    fit.looking.solve(MODEL_ERROR)
-    chi2 = fit._chi2(scenes, theta)
-    near = chi2 < fit.chi2[scenes] + MAX_WINGS_LOSS
-    fit.looking.restore(before[2], scenes[~near])
-    scenes, chi2 = scenes[near], chi2[near]
-    if len(scenes):
-        fit.theta[scenes], fit.chi2[scenes] = theta[scenes], chi2
-        fit._look(scenes, fit.theta, slopes=True)
-        fit.looking.compute_residuals(MODEL_ERROR)
-        fit._take_equations(scenes)
-        fit._step(scenes)
-        stays = before[0][scenes] <= fit.chi2[scenes]
-        fit.wings = wings_error(fit, before, scenes, stays)
-        fit._restore(before, scenes[stays])
-
-
-def wings_error(fit, before, scenes, stays):
-    """The `wings` (N, C) of a ProfileFit that fitted scenes (k,) again from a `_copy`.
-
-    stays (k,): scenes whose fit of the copy stays
-    """
-    penalty = [fit.population.penalty(scenes, theta) for theta in (before[1], fit.theta)]
-    loss = fit.chi2[scenes] - penalty[1] - before[0][scenes] + penalty[0]
-    weight = np.zeros((len(fit.theta), 1))
-    weight[scenes, 0] = expit(np.where(stays, -loss, loss) / 2)
-    change = fit.looking.spectra - before[2][0]
-    return np.sqrt(weight)[fit.looking.scene] * change
