@@ -148,14 +148,17 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes, *, doubt=True):
-        """Solves some scenes and stores a step's inputs; doubt: contaminate blended shapes."""
+        """Solves some scenes and stores a step's inputs.
+
+        doubt: True = contaminate blended shapes; False = none; None = as before
+        """
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
             if doubt:
                 self._doubt(scenes)
-            else:
+            elif doubt is not None:
                 self.population.contamination[scenes] = 1
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
