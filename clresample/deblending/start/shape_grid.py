@@ -170,7 +170,8 @@ def _alternatives(theta, *, far):
     """Parameters (K, 4) of the present profile (4,), of those near it and, if `far`, of larger."""
     ln_beta = LN_BETA.copy()
     ln_beta[np.argmin(np.abs(ln_beta - theta[3]))] = theta[3]
-    pairs = [*itertools.product(SIZE_STEPS, ln_beta), *((s, FAR_LN_BETA) for s in FAR_STEPS * far)]
+    larger = FAR_STEPS if far else ()
+    pairs = [*itertools.product(SIZE_STEPS, ln_beta), *((s, FAR_LN_BETA) for s in larger)]
     out = np.tile(theta, (1 + len(pairs), 1))
     step, out[1:, 3] = np.array(pairs).T
     out[1:, 0] += step
