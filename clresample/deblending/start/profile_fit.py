@@ -40,8 +40,7 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
-    flux_scatter (N, C): of the spectra by size and wings, of faint galaxies, see shape_grid.py; 0
-        for others
+    flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -55,8 +54,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness = np.zeros(len(shapes))
-        self.flux_scatter = np.zeros_like(looking.spectra)
+        self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -148,10 +146,7 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes, *, doubt=True):
-        """Solves some scenes and stores a step's inputs.
-
-        doubt: True = contaminate blended shapes; False = none; None = as before
-        """
+        """Solves some scenes for a step; doubt: contaminate blended shapes; None = as before."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)

@@ -139,7 +139,7 @@ def _computed(fit, components):
     row, present = looking.rows_of(looking.scene[components]), looking.spectra[components]
     power = looking.normal[row, :, looking.index[components], looking.index[components]]
     significant = (np.square(present) * power).sum(axis=1) >= NEED
-    thetas, off, level = fit.thetas(), *(a[row] for a in looking.of_level())
+    thetas, (off, level) = fit.thetas(), (a[row] for a in looking.of_level())
     own = [
         _alternatives(thetas[i], far=not light)
         for i, light in zip(components, significant, strict=True)
