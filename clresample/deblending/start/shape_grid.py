@@ -1,4 +1,4 @@
-"""Size and wings of faint galaxies from a grid, where least squares give neither value nor error.
+"""Size and wings of faint galaxies from a grid, where least squares do not give them.
 
 Chi2 of a faint galaxy is far from quadratic in ln sigma and ln beta: profiles of half and of twice
 its flux may fit as well, and steps from a small profile do not reach a large one. On a grid of both
