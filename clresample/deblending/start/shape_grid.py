@@ -30,9 +30,9 @@ from .component_batch import peaks_of, renumbered
 from .first_profiles import NEED
 from .population import LEARNED
 
-# Smallest error of ln sigma of galaxies with a grid: of 0.05, errors of galaxies of signal to noise
-# 40 change by 2 % (bench.ladder).
-MIN_SIZE_ERROR = 0.08
+# Smallest error of ln sigma of galaxies with a grid. With 0.08 a flux at signal to noise 40 is 0.75
+# of the truth, six of its errors (bench.ladder, n = 2.5), since wings that it has are not found.
+MIN_SIZE_ERROR = 0.05
 # Fraction of galaxies of any size and wings, and the ranges of both. With 0.1, galaxies of n = 4
 # at signal to noise 10 to 20 are fainter by 0.15 of their errors (bench.ladder).
 UNUSUAL, SIZE_RANGE, WINGS_RANGE = 0.3, 4.0, 3.0
