@@ -209,18 +209,33 @@ def with_errors(fit, result, peaks, seen):
     )
     fit.note_seconds("errors", time.perf_counter() - began)
     cores = core_errors(result, fit.settings.psf_error)
-    wings = np.zeros_like(outside)
-    wings[fit.fitted] = start.wings * fit.unit
-    wings = np.hypot(wings, missed_light(result))
-    errors = with_core_errors(widened(with_common_error(errors, wings), outside), cores)
+    shapes = np.hypot(_beyond_curvature(fit, result, errors), missed_light(result))
+    errors = with_core_errors(widened(with_common_error(errors, shapes), outside), cores)
     doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
     exchanged = exchanged_light(result, start.source, fit.scene)
     errors = with_shared_light(errors, doubts, exchanged)
-    own = np.flatnonzero(wings.any(axis=1))  # each an independent change of one source's fluxes
-    changes = np.eye(len(wings))[:, None, own] * wings[:, :, None]
+    own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
+    changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
     changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged)
     draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
+
+
+def _beyond_curvature(fit, result, errors):
+    """Errors (S, C) [counts] of fluxes by size and wings, as far as `errors` are too small for it.
+
+    `errors` have the curvature about the fitted shape, the start's scatter (shape_grid.py) all
+    shapes that fit.
+    """
+    scatter, variance = np.zeros_like(errors.flux_bound_bias), np.zeros_like(errors.flux_bound_bias)
+    scatter[fit.fitted] = fit.start.flux_scatter * fit.unit
+    for i, c in enumerate(result.components):
+        fixed = np.nan_to_num(result.covariance[:, i, i], posinf=0)
+        variance[c.source] += fixed * c.morphology.sum(dtype=np.float64) ** 2
+    own = np.maximum(np.diagonal(errors.colour, axis1=1, axis2=2) - variance, 0).sum(axis=1)
+    found = (scatter**2).sum(axis=1)
+    missing = np.divide(found - own, found, out=np.zeros_like(found), where=found > own)
+    return np.sqrt(missing)[:, None] * scatter
 
 
 def posterior_of(fit, morphs, peaks, seen):

@@ -116,6 +116,11 @@ class PopulationPrior:
         pulled = np.where(self.galaxies[scenes][..., None], tail, away)
         return (self.contamination[scenes][..., None] * pulled).sum(axis=(1, 2))
 
+    def penalty_of(self, scene, index, theta):
+        """Terms (k,) added to chi2 by parameters (k, p) of one galaxy."""
+        away = np.square((theta - self.mean[scene, index]) / self.scatter[scene, index])
+        return self.contamination[scene, index] * (TAILS * np.log1p(away / TAILS)).sum(axis=1)
+
     def _away(self, scenes, theta):
         """Squared distances (k, n, p) of parameters (B, n, p) from their means, in scatters."""
         return np.square((theta[scenes] - self.mean[scenes]) / self.scatter[scenes])

@@ -5,15 +5,15 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
-from scipy.special import expit
 
 from ..spectra import MODEL_ERROR
 from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
-from .first_profiles import GROWTH, NEED, WIDE_WINGS, first_profiles
+from .first_profiles import GROWTH, NEED, first_profiles
 from .linearised_scenes import LinearisedScenes
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
-from .step_control import StepControl, gain_of, wings_scale
+from .shape_grid import fit_faint_shapes
+from .step_control import StepControl
 
 # Largest number of steps, and the gain in chi2 below which they end, measured or expected.
 N_STEPS, CHI2_TOL = 40, 1.0
@@ -28,15 +28,6 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # the grid of sizes. Of 30 scenes with large galaxies (bench.ladder, seed 77) second starts gained
 # 6 in chi2 at most where the large galaxies were those that had grown, but for one.
 MIN_GROWTH = 0.5 * np.log(GROWTH)
-# A scene is fitted once more from wide wings if these alone, with all else as fitted, raise chi2 by
-# less than this. Chi2 of faint galaxies with the prior has two minima, with and without wings, of
-# fluxes that differ by a third (bench.ladder, n = 4 at signal to noise 10 to 30); 5 and 20 give the
-# same results there.
-MAX_WINGS_LOSS = 20.0
-# That rise is not computed where the equations predict more than this many times as much. Of 38
-# scenes (bench.ladder, seed 99, and COSMOS galaxies) they predict 0.7 to 4 times the rise where it
-# is below 100, and at most 54 where it is below 20.
-DOUBT_OF_LOSS = 20.0
 
 
 class ProfileFit:
@@ -49,8 +40,7 @@ class ProfileFit:
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
     started (B,): bool, scenes that go on from an earlier fit and are not started a second time
-    wings (N, C): root mean square change of the spectra by the fit with other wings that did not
-        stay, if both were as probable before the data; 0 where there was none
+    flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -65,7 +55,7 @@ class ProfileFit:
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.started = np.zeros(size[0], bool)
-        self.brightness, self.wings = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
+        self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -88,7 +78,7 @@ class ProfileFit:
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
-        _run_from_wings(self, np.flatnonzero(some))
+        fit_faint_shapes(self, np.flatnonzero(some))
 
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
@@ -152,15 +142,13 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes, *, doubt=True):
-        """Solves some scenes and stores a step's inputs; doubt: contaminate blended shapes."""
+        """Solves some scenes and stores a step's inputs; doubt: contaminate shapes anew."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
             if doubt:
                 self._doubt(scenes)
-            else:
-                self.population.contamination[scenes] = 1
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
@@ -308,55 +296,3 @@ def _run_without_doubt(fit, scenes):
         worse = scenes[before[0][scenes] <= fit.chi2[scenes]]
         fit._restore(before, worse)
         fit._look_again(worse)
-
-
-def _run_from_wings(fit, scenes):
-    """Fits scenes of a ProfileFit again from wide wings if the data may have them.
-
-    The better fit stays.
-    """
-    compact = fit.population.galaxies & (fit.theta[..., 3] > np.log(WIDE_WINGS))
-    scenes = scenes[compact[scenes].any(axis=1)]
-    if not len(scenes):
-        return
-    theta = fit.theta.copy()
-    theta[compact, 3] = np.log(WIDE_WINGS)
-    scenes = scenes[_wings_loss(fit, scenes, theta) < DOUBT_OF_LOSS * MAX_WINGS_LOSS]
-    if not len(scenes):
-        return
-    before = fit._copy()
-    fit._look(scenes, theta, slopes=False)
-    fit.looking.solve(MODEL_ERROR)
-    chi2 = fit._chi2(scenes, theta)
-    near = chi2 < fit.chi2[scenes] + MAX_WINGS_LOSS
-    fit.looking.restore(before[2], scenes[~near])
-    scenes, chi2 = scenes[near], chi2[near]
-    if len(scenes):
-        fit.theta[scenes], fit.chi2[scenes] = theta[scenes], chi2
-        fit._look_again(scenes)
-        fit._step(scenes)
-        stays = before[0][scenes] <= fit.chi2[scenes]
-        fit.wings = wings_error(fit, before, scenes, stays)
-        fit._restore(before, scenes[stays])
-
-
-def _wings_loss(fit, scenes, theta):
-    """Rise (k,) of chi2 from the fit's parameters to others (B, n, 4), by its equations."""
-    normal, right, now = fit._equations(scenes)
-    (scale, per_scale), there = wings_scale(now), wings_scale(theta[scenes])[0]
-    step = np.zeros(now.shape)
-    step[..., 3] = (scale - there) * per_scale
-    return -gain_of(normal, right, step.reshape(right.shape))
-
-
-def wings_error(fit, before, scenes, stays):
-    """The `wings` (N, C) of a ProfileFit that fitted scenes (k,) again from a `_copy`.
-
-    stays (k,): scenes whose fit of the copy stays
-    """
-    penalty = [fit.population.penalty(scenes, theta) for theta in (before[1], fit.theta)]
-    loss = fit.chi2[scenes] - penalty[1] - before[0][scenes] + penalty[0]
-    weight = np.zeros((len(fit.theta), 1))
-    weight[scenes, 0] = expit(np.where(stays, -loss, loss) / 2)
-    change = fit.looking.spectra - before[2][0]
-    return np.sqrt(weight)[fit.looking.scene] * change

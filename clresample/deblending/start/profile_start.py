@@ -68,7 +68,7 @@ class StartingPoint:
     peaks (n,): by which profiles of unit integral are divided, so that max = 1
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
-    wings (S, C): error of the sources' fluxes by wings that the data do not tell, see ProfileFit
+    flux_scatter (S, C): of the sources' fluxes by size and wings, see ProfileFit
     """
 
     source: np.ndarray
@@ -81,7 +81,7 @@ class StartingPoint:
     spectra: np.ndarray
     sky: np.ndarray
     spectrum_curvature: np.ndarray
-    wings: np.ndarray | float = 0.0
+    flux_scatter: np.ndarray | float = 0.0
 
     def __len__(self):
         return len(self.shapes)
@@ -163,8 +163,8 @@ def _point(patch, fit, thetas, sources, b, dark):
         center = positions[sources[i]]
         peaks[k] = profile_peak(c.shape, thetas[i], c.position, center, c.frame)
     power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
-    wings = np.zeros((len(patch.sources), looking.spectra.shape[1]))
-    np.add.at(wings, sources[at], fit.wings[at])
+    scatter = np.zeros((len(patch.sources), looking.spectra.shape[1]))
+    np.add.at(scatter, sources[at], fit.flux_scatter[at])
     return StartingPoint(
         source=sources[at],
         positions=positions,
@@ -176,7 +176,7 @@ def _point(patch, fit, thetas, sources, b, dark):
         spectra=looking.spectra[at] * peaks[:, None],
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
-        wings=wings,
+        flux_scatter=scatter,
     )
 
 

@@ -1,0 +1,222 @@
+"""Size and wings of faint galaxies from a grid, where least squares do not give them.
+
+Chi2 of a faint galaxy is far from quadratic in ln sigma and ln beta: profiles of half and of twice
+its flux may fit as well, and steps from a small profile do not reach a large one. On a grid of both
+the flux of every profile u is solved for, with neighbours as they are, which changes chi2 by
+
+    -gain = -sum_c max(0, b)^2 / p,    b = <u, r>,    p = <u, u>,
+
+where r is the data minus the models of all others, and the sky's level is eliminated from b and p.
+If a profile is better than the fitted one, the scene is fitted again from it. The weights
+
+    exp(gain / (2 contamination)) ((1 - UNUSUAL) prior + UNUSUAL / (SIZE_RANGE WINGS_RANGE))
+
+are the posterior of size and wings. The prior and the contamination are the population's
+(population.py); unusual galaxies have any size and wings. Errors of fluxes include the flux's
+scatter under this posterior (posterior.py), which is about its mean if most of its weight is of
+unusual galaxies: these get the mean size and wings.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..profiles import GalaxyProfile
+from ..spectra import MODEL_ERROR
+from .component_batch import peaks_of, renumbered
+from .first_profiles import NEED
+from .population import LEARNED
+
+# Smallest error of ln sigma of galaxies with a grid. With 0.08 a flux at signal to noise 40 is 0.75
+# of the truth, six of its errors (bench.ladder, n = 2.5), since wings that it has are not found.
+MIN_SIZE_ERROR = 0.05
+# Fraction of galaxies of any size and wings, and the ranges of both. With 0.1, galaxies of n = 4
+# at signal to noise 10 to 20 are fainter by 0.15 of their errors (bench.ladder).
+UNUSUAL, SIZE_RANGE, WINGS_RANGE = 0.3, 4.0, 3.0
+# Posterior fraction of unusual galaxies from which an estimate moves. If all move, median SDRs of
+# simulated COSMOS galaxies are 0.3 dB lower in Euclid's images (32 scenes, seed 3000).
+MIN_UNUSUAL = 0.5
+# Steps from the fitted ln sigma, and the values of ln beta at each of them.
+SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.9, -0.1, -1.1, -2.1])
+# Further steps for galaxies without significant light, and their ln beta: light of galaxies of r_e
+# over 25 px at signal to noise 10 to 15 is not significant in a small profile (bench.ladder).
+FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
+# Smallest decrease of chi2 for another fit.
+MIN_GAIN = 1.0
+# Largest number of galaxies of a scene whose grids are rendered at once.
+MAX_AT_ONCE = 8
+
+
+def fit_faint_shapes(fit, scenes):
+    """Sets size and wings of faint galaxies in some scenes (k,) of a ProfileFit from their grids.
+
+    Stores the scatter of their fluxes in its `flux_scatter`.
+    """
+    grids = _grids(fit, _uncertain(fit, scenes))
+    better = {i: grid.theta[grid.best(fit)] for i, grid in grids.items() if grid.best(fit)}
+    if better:
+        changed = _fitted_again(fit, better)
+        grids |= _grids(fit, [i for i in grids if fit.looking.scene[i] in changed])
+    for i, grid in grids.items():
+        if grid.gain.max() >= NEED * grid.contamination(fit):
+            fit.theta[grid.scene, grid.index], fit.flux_scatter[i] = grid.posterior(fit)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeGrid:
+    """Alternative profiles of one component, the present one first; see the module's text.
+
+    scene, index: of the component; theta (K, 4); gain (K,); flux (K, C): in the frame, in the
+    views' units
+    """
+
+    scene: int
+    index: int
+    theta: np.ndarray
+    gain: np.ndarray
+    flux: np.ndarray
+
+    def contamination(self, fit):
+        """Factor by which errors of its neighbours' models lower the data's precision."""
+        return fit.population.contamination[self.scene, self.index]
+
+    def best(self, fit):
+        """Index of the best profile with significant light, 0 if it gains less than MIN_GAIN."""
+        loss = fit.population.penalty_of(self.scene, self.index, self.theta) - self.gain
+        best = int(np.argmin(loss))
+        significant = self.gain[best] >= NEED * self.contamination(fit)
+        return best if significant and loss[best] < loss[0] - MIN_GAIN else 0
+
+    def posterior(self, fit):
+        """Parameters (4,) to be set, and the scatter (C,) of the flux about theirs."""
+        grid = slice(1, 1 + len(SIZE_STEPS) * len(LN_BETA))
+        theta, flux, gain = self.theta[grid], self.flux[grid], self.gain[grid]
+        at = self.scene, self.index, LEARNED
+        scatter = fit.population.scatter[at]
+        away = (theta[:, LEARNED] - fit.population.mean[at]) / scatter
+        usual = np.exp(-np.square(away).sum(axis=1) / 2) / (2 * np.pi * scatter.prod())
+        unusual = UNUSUAL / (SIZE_RANGE * WINGS_RANGE)
+        prior = (1 - UNUSUAL) * usual + unusual
+        weight = np.exp((gain - gain.max()) / (2 * self.contamination(fit))) * prior
+        weight /= weight.sum()
+        moves = weight @ (unusual / prior) > MIN_UNUSUAL
+        found, about = (weight @ theta, weight @ flux) if moves else (self.theta[0], self.flux[0])
+        return found, np.sqrt(weight @ np.square(flux - about))
+
+
+def _uncertain(fit, scenes):
+    """Galaxies in some scenes (k,) whose sizes have large errors, as a list of components."""
+    k, (n, p) = len(scenes), fit.theta.shape[1:]
+    each = fit._equations(scenes)[0].reshape(k, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
+    uncertain = np.zeros(fit.source.shape, bool)
+    uncertain[scenes] = np.linalg.inv(each)[..., 0, 0].T > MIN_SIZE_ERROR**2
+    return [
+        i
+        for i, c in enumerate(fit.looking.components)
+        if isinstance(c.shape, GalaxyProfile) and c.shape.whole and uncertain[c.scene, c.index]
+    ]
+
+
+def _grids(fit, components):
+    """The ShapeGrids {component: grid}, of few components of a scene at once."""
+    count, rounds = {}, {}
+    for i in components:
+        scene = fit.looking.scene[i]
+        count[scene] = count.get(scene, 0) + 1
+        rounds.setdefault((count[scene] - 1) // MAX_AT_ONCE, []).append(i)
+    return {i: grid for some in rounds.values() for i, grid in _computed(fit, some)}
+
+
+def _computed(fit, components):
+    """Pairs of some components and their ShapeGrids."""
+    looking, scenes = fit.looking, np.unique(fit.looking.scene[components])
+    fit._look(scenes, fit.theta, slopes=False)
+    looking.solve(MODEL_ERROR)
+    looking.compute_residuals(MODEL_ERROR)
+    row, present = looking.rows_of(looking.scene[components]), looking.spectra[components]
+    power = looking.normal[row, :, looking.index[components], looking.index[components]]
+    significant = (np.square(present) * power).sum(axis=1) >= NEED
+    thetas, (off, level) = fit.thetas(), (a[row] for a in looking.of_level())
+    own = [
+        _alternatives(thetas[i], far=not light)
+        for i, light in zip(components, significant, strict=True)
+    ]
+    owner, theta = np.repeat(np.arange(len(own)), [len(a) for a in own]), np.concatenate(own)
+    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    listed = renumbered(looking.components[components[q]] for q in owner)
+    peaks, around = peaks_of(listed, theta), looking.with_components(listed)
+    brightness = fit.brightness[components][owner] * np.minimum(peaks / peaks[first][owner], 1)
+    around.render(scenes, theta, brightness, slopes=False)
+    right, alone, sky = _products(around, present, owner, first)
+    if looking.fit_sky:
+        off = (off + present * sky[first])[owner]
+        part = np.divide(sky, level[owner], out=np.zeros_like(sky), where=level[owner] > 0)
+        right, alone = right - part * off, alone - part * sky
+    right = np.maximum(right, 0)
+    if looking.ties is not None:
+        right, alone = (looking.ties.spread(looking.ties.total(a)) for a in (right, alone))
+    flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
+    gain = right * flux if looking.ties is None else (right * flux)[:, looking.ties.first]
+    parts = gain.sum(axis=1), flux * _part_inside(listed, theta)[:, None]
+    for q, i in enumerate(components):
+        at = looking.scene[i], looking.index[i]
+        yield i, ShapeGrid(*at, own[q], *(part[owner == q] for part in parts))
+
+
+def _alternatives(theta, *, far):
+    """Parameters (K, 4) of the present profile (4,), of those near it and, if `far`, of larger."""
+    ln_beta = LN_BETA.copy()
+    ln_beta[np.argmin(np.abs(ln_beta - theta[3]))] = theta[3]
+    larger = FAR_STEPS if far else ()
+    pairs = [*itertools.product(SIZE_STEPS, ln_beta), *((s, FAR_LN_BETA) for s in larger)]
+    out = np.tile(theta, (1 + len(pairs), 1))
+    step, out[1:, 3] = np.array(pairs).T
+    out[1:, 0] += step
+    return out
+
+
+def _products(around, present, owner, first):
+    """Products (n, C) of alternatives with the data without others, with themselves, with a level.
+
+    present (q, C): spectra of the present profiles, the `first` (q,) of each owner's; owner (n,)
+    """
+    right, alone, sky = np.zeros((3, len(owner), present.shape[1]))
+    is_first = np.isin(np.arange(len(owner)), first)
+    for sight in around.sights:
+        table, _ = sight.overlapping_pairs()
+        one, other = around.at[table[:, :2]].T
+        use = (owner[one] == owner[other]) & ((one == other) | is_first[one] | is_first[other])
+        one, other, channels = one[use], other[use], sight.channels
+        gram = sight.gram(around.device.put(table[use].astype(np.int32)), 1)[..., 0, 0]
+        pull = sight.residual_products(1)[:, :, 0]
+        right[around.at, channels], sky[around.at, channels] = np.moveaxis(pull, -1, 0)
+        same, own = one == other, present[owner[one]][:, channels] * gram
+        alone[one[same], channels] = gram[same]
+        right[one[is_first[other]], channels] += own[is_first[other]]
+        turned = is_first[one] & ~same
+        right[other[turned], channels] += own[turned]
+    return right, alone, sky
+
+
+def _part_inside(components, theta):
+    """Fractions (n,) of the light of galaxies inside their frames, as if these were round."""
+    half = np.array([min(c.frame) for c in components]) / 2
+    psf = np.array([np.trace(c.shape.psf_moment) for c in components]) / 2
+    beta, width = np.exp(theta[:, 3]), np.exp(2 * theta[:, 0]) + psf
+    return 1 - (1 + half**2 / width / (2 * beta)) ** -beta
+
+
+def _fitted_again(fit, better):
+    """Fits scenes again from {component: parameters}; those (k,) for which that is better."""
+    looking, before = fit.looking, fit._copy()
+    scenes = np.unique(looking.scene[list(better)])
+    for i, theta in better.items():
+        fit.theta[looking.scene[i], looking.index[i]] = theta
+    fit._take(scenes, doubt=False)
+    fit._step(scenes)
+    stays = before[0][scenes] <= fit.chi2[scenes]
+    fit._restore(before, scenes[stays])
+    return scenes[~stays]

@@ -1,0 +1,196 @@
+"""Faint galaxies of uncertain size and wings: gains of profiles, one to be set, flux errors."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.scenes import MODEL_PSF, frame
+
+from clresample import ExtendedSource, Grid, Observation, Settings, deblend
+from clresample.deblending.profiles import profile, psf_second_moment
+from clresample.deblending.start import profile_fit, shape_grid
+from clresample.deblending.start.population import LEARNED, PopulationPrior
+from clresample.deblending.start.shape_grid import LN_BETA, SIZE_STEPS, UNUSUAL, ShapeGrid
+
+SHAPE, SIDE_PX = (64, 64), 160
+PLACES = (31.3, 32.1), (14.0, 40.0)
+
+
+def galaxy(size_px, beta, snr, place=PLACES[0], shape=SHAPE):
+    """Image of a galaxy of this signal to noise, for noise of 1."""
+    theta = np.array([np.log(size_px), 0.1, 0.0, np.log(beta)])
+    image = profile(theta, place, shape, psf_second_moment(MODEL_PSF), slopes=False)[0]
+    return image * snr / np.linalg.norm(image)
+
+
+@pytest.fixture
+def fitted(device, monkeypatch):
+    """Deblends an image with noise, one observation or more of a band; the ProfileFit, Result."""
+
+    def fit_of(image, places=PLACES[:1], *, n=1, looked=shape_grid.fit_faint_shapes, **settings):
+        fits, rng = [], np.random.default_rng(3)
+
+        def noted(fit, scenes):
+            fits.append(fit)
+            looked(fit, scenes)
+
+        monkeypatch.setattr(profile_fit, "fit_faint_shapes", noted)
+        noise = np.sqrt(n) * rng.normal(size=(n, *image.shape))
+        pixels = Grid.flat(image.shape, 0.1)
+        observations = [
+            Observation(image + one, MODEL_PSF, pixels, weights=1 / n, channels=[f"r{i}"],
+                        bands=["r"], zero_points=25.0)
+            for i, one in enumerate(noise)
+        ]  # fmt: skip
+        sources = [ExtendedSource(position_px=place) for place in places]
+        options = {"frame": frame(image.shape), "device": device}
+        return fits, deblend(observations, sources, settings=Settings(**settings), **options)
+
+    return fit_of
+
+
+@pytest.mark.parametrize("n, fit_sky", [(1, False), (1, True), (3, False), (3, True)])
+def test_gains_are_differences_of_chi2(fitted, monkeypatch, n, fit_sky):
+    """With a sky level and with exposures of a band; fluxes are of the light in the frame."""
+    monkeypatch.setattr(shape_grid, "MODEL_ERROR", 0.0)  # weights that stay as the sky changes
+    image, compared = galaxy(2.5, 2.0, 16) + fit_sky * 0.05, []
+
+    def looked(fit, scenes):
+        grid = shape_grid._grids(fit, [0])[0]
+        for theta in grid.theta[:: len(grid.theta) // 6]:
+            fit._look(scenes, theta[None, None], slopes=False)
+            fit.looking.solve(0.0)
+            chi2 = fit.looking.compute_residuals(0.0)[0]
+            inside = shape_grid._part_inside(fit.looking.components, theta[None])
+            compared.append((chi2, *fit.looking.spectra[0] * inside))
+        compared.append(grid)
+
+    fitted(image, n=n, looked=looked, fit_sky=fit_sky)
+    found, grid = np.array(compared[:-1]), compared[-1]
+    some = slice(None, None, len(grid.theta) // 6)
+    gain = grid.gain[some] - grid.gain[0]
+    assert np.ptp(gain) > 10
+    np.testing.assert_allclose(found[0, 0] - found[:, 0], gain, atol=0.1)
+    np.testing.assert_allclose(found[:, 1:], grid.flux[some], rtol=5e-3)
+
+
+def test_neighbours_stay_as_they_are(fitted):
+    """The gain of a profile is of the data without the other source, in the order of the list."""
+    image, kept = galaxy(2.5, 6.0, 20) + galaxy(1.5, 6.0, 60, PLACES[1]), []
+
+    def looked(fit, scenes):
+        kept.append(shape_grid._grids(fit, [1, 0][-len(fit.counts) :]))
+
+    fitted(image, PLACES[::-1], looked=looked)
+    fitted(galaxy(2.5, 6.0, 20), looked=looked)
+    both, alone = kept[0], kept[1][0]
+    assert list(both) == [1, 0] and [both[i].index for i in both] == [1, 0]
+    np.testing.assert_allclose(both[1].gain.max(), alone.gain.max(), rtol=0.03)
+    np.testing.assert_allclose(both[1].flux[0], alone.flux[0], rtol=0.03)
+
+
+@pytest.mark.parametrize("beta, wide", [(0.5, True), (6.5, False)])
+def test_wings_are_found_where_the_data_have_them(fitted, beta, wide):
+    """At signal to noise 14, where steps from no wings end at none."""
+    (fit,), _ = fitted(galaxy(2.5, beta, 14))
+    assert (np.exp(fit.theta[0, 0, 3]) < 1.5) == wide
+
+
+def test_a_large_galaxy_without_light_in_a_small_profile_is_found(fitted):
+    """Ten times the expected size, at signal to noise 14."""
+    middle = (SIDE_PX / 2, SIDE_PX / 2)
+    image = galaxy(25.0, 6.0, 14, middle, (SIDE_PX, SIDE_PX))
+    (fit,), result = fitted(image, [middle], fit_shifts=False)
+    assert np.exp(fit.theta[0, 0, 0]) > 15
+    error = np.sqrt(result.errors.flux[0, 0, 0])
+    flux = sum(c.flux[0] for c in result.components)
+    assert abs(flux - image.sum()) < 2 * error < image.sum()
+
+
+def test_errors_hold_shapes_that_curvature_does_not(fitted):
+    """All of the variance beside that of a known shape is the scatter's, in draws too."""
+    image = galaxy(2.5, 0.8, 12)
+    (fit,), result = fitted(image)
+
+    def unscattered(fit, scenes):
+        shape_grid.fit_faint_shapes(fit, scenes)
+        fit.flux_scatter[:] = 0
+
+    _, without = fitted(image, looked=unscattered)
+    scatter = fit.flux_scatter[0, 0]
+    flux, known = result.components[0].flux[0], result.covariance[0, 0, 0]
+    fixed = known * result.components[0].morphology.sum(dtype=float) ** 2
+    assert scatter > 0.15 * flux
+    variance, curvature = result.errors.flux[0, 0, 0], without.errors.flux[0, 0, 0]
+    assert variance > 1.1 * curvature
+    assert variance == pytest.approx(scatter**2 + fixed, rel=1e-3)
+    assert result.errors.colour[0, 0, 0] == pytest.approx(variance)
+    changes = result.draws.flux_changes
+    assert changes.source.tolist() == [0] and changes.change.tolist() == [0]
+    assert changes.by[0, 0] ** 2 == pytest.approx(variance - curvature, rel=1e-3)
+
+
+def test_a_scatter_below_the_curvature_changes_no_error(fitted):
+    """Errors are those of the curvature where these are larger."""
+    image, found = galaxy(2.5, 6.5, 14), []
+    for part in (0.01, 0.0):
+
+        def looked(fit, scenes, part=part):
+            fit.flux_scatter[0] = part * fit.looking.spectra[0]
+
+        found.append(fitted(image, looked=looked)[1].errors.flux)
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.fixture
+def grid():
+    """Makes a ShapeGrid with these gains (size, wings), and a fit for it with usual galaxies."""
+
+    def made(gain, contamination=1.0):
+        theta = shape_grid._alternatives(np.array([0.0, 0.1, -0.2, 1.9]), far=False)
+        shape = SimpleNamespace(mean=np.array([0, 0, 0, 1.9]), scatter=np.array([0.4, 1, 1, 0.7]))
+        prior = PopulationPrior([shape], [0], [0], 1, 1, 4)
+        prior.contamination[0, 0] = contamination
+        flux = np.exp(theta[:, :1] - theta[:, 3:])
+        gains = np.append(50.0, np.broadcast_to(gain, (len(SIZE_STEPS), len(LN_BETA))).ravel())
+        return ShapeGrid(0, 0, theta, gains, flux), SimpleNamespace(population=prior)
+
+    return made
+
+
+def test_a_usual_galaxy_stays_and_its_error_holds_the_distance(grid):
+    """The scatter is about the present flux; weights are prior and gain over contamination."""
+    gain = 50 - np.abs(np.arange(len(SIZE_STEPS)) - 2)[:, None] * np.array([1, 1, 9, 9, 9])
+    found, fit = grid(gain, 2.0)
+    theta, scatter = found.posterior(fit)
+    np.testing.assert_array_equal(theta, found.theta[0])
+    away = (found.theta[1:][:, LEARNED] - [0, 1.9]) / [0.4, 0.7]
+    prior = np.exp(-(away**2).sum(1) / 2) / (2 * np.pi * 0.28)
+    weight = np.exp(gain.ravel() / 4) * ((1 - UNUSUAL) * prior + UNUSUAL / 12)
+    expected = np.average((found.flux[1:] - found.flux[0]) ** 2, axis=0, weights=weight)
+    np.testing.assert_allclose(scatter, np.sqrt(expected))
+
+
+def test_an_unusual_galaxy_gets_the_mean(grid):
+    """Two profiles with wings that fit as well: between them, and half of their distance."""
+    gain = np.full((len(SIZE_STEPS), len(LN_BETA)), 10.0)
+    gain[4, 4] = gain[6, 4] = 60
+    found, fit = grid(gain)
+    theta, scatter = found.posterior(fit)
+    np.testing.assert_allclose(theta, [0.9, 0.1, -0.2, LN_BETA[4]], atol=1e-3)
+    one, other = found.flux[[1 + 4 * 5 + 4, 1 + 6 * 5 + 4]]
+    np.testing.assert_allclose(scatter, (other - one) / 2, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "present, gain, contamination, found",
+    [(50, 53, 1, True), (50, 52.5, 1, False), (50, 60, 2.5, False), (50, 63, 2.5, True),
+     (0, 24, 1, False), (0, 26, 1, True)],
+)  # fmt: skip
+def test_fits_again_are_from_significant_profiles(grid, present, gain, contamination, found):
+    """Better by 1 with the prior, 1.8 contamination here, and by 25 contamination than no light."""
+    gains = np.zeros((len(SIZE_STEPS), len(LN_BETA)))
+    gains[4, 0] = gain
+    alternatives, fit = grid(gains, contamination)
+    alternatives.gain[0] = present
+    assert alternatives.best(fit) == (1 + 4 * len(LN_BETA)) * found
