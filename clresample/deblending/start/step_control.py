@@ -1,4 +1,4 @@
-"""Steps of Levenberg-Marquardt of a group of scenes, each with its own damping and longest step."""
+"""Steps of Levenberg-Marquardt of a group of scenes, each with its own damping and length."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PROMISED = 0.5
 # a rejected step it is a quarter of that step, after others twice as long as before, up to this.
 LONGEST_STEP = 1.0
 # Largest fraction by which a step lowers ln(1 + 1 / beta), which is 0 for a Gaussian.
-MOST_OF_WINGS = 0.9
+MAX_FALL_OF_WINGS = 0.9
 
 
 class StepControl:
@@ -38,7 +38,7 @@ class StepControl:
         """
         scale, per_scale = wings_scale(theta)
         most = np.full(theta.shape, np.inf)
-        most[..., 3] = np.where(galaxies, MOST_OF_WINGS * scale * per_scale, np.inf)
+        most[..., 3] = np.where(galaxies, MAX_FALL_OF_WINGS * scale * per_scale, np.inf)
         most, moves = most.reshape(right.shape), np.ones(right.shape, bool)
         if free is not None:
             moves = np.repeat(free, N_PARAMETERS, axis=1)
