@@ -263,7 +263,8 @@ class ProfileFit:
 def _run_without_doubt(fit, scenes):
     """Fits scenes of a ProfileFit again without contamination of their shapes.
 
-    The better fit stays. If one of two similar galaxies has the other one's light, that one's shape is contaminated.
+    The better fit stays. If one of two similar galaxies has the other one's light, that one's shape
+    is contaminated.
     """
     before = fit._copy()
     fit.population.contamination[scenes] = 1
