@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.start.step_control import LONGEST_STEP, StepControl
+from clresample.deblending.start.step_control import MAX_STEP, StepControl
 
 
 def first_step(right, theta=(0, 0, 0, 1.5), *, normal=None, galaxy=True, free=None, damping=0.0):
@@ -24,7 +24,7 @@ def test_a_step_is_newton_s_and_promises_its_gain():
 
 def test_long_steps_are_cut_and_promise_less():
     trial, whole, taken = first_step([3.0, 0, 0, 0])
-    assert trial[0] == LONGEST_STEP and whole == pytest.approx(9)
+    assert trial[0] == MAX_STEP and whole == pytest.approx(9)
     assert taken == pytest.approx(2 * 3 - 1)
 
 
@@ -68,7 +68,7 @@ def test_stars_have_no_wings():
 
 @pytest.mark.parametrize(
     ("gain", "factor", "longest"),
-    [(0.9, 1 / 3, LONGEST_STEP), (0.2, 3, LONGEST_STEP), (-0.1, 10, 0.1), (np.nan, 10, 0.1)],
+    [(0.9, 1 / 3, MAX_STEP), (0.2, 3, MAX_STEP), (-0.1, 10, 0.1), (np.nan, 10, 0.1)],
 )
 def test_damping_follows_the_gain(gain, factor, longest):
     """Less after a step as promised, more after another, ten times after a rejected one."""
@@ -79,6 +79,6 @@ def test_damping_follows_the_gain(gain, factor, longest):
     steps.next(scenes, np.eye(4)[None], right, zero, np.array([[False]]))
     assert steps.take(scenes, np.array([gain]), np.array([1.0])).all()
     np.testing.assert_allclose(steps.damping, before * [1, factor])
-    np.testing.assert_allclose(steps.longest, [LONGEST_STEP, longest])
+    np.testing.assert_allclose(steps.longest, [MAX_STEP, longest])
     steps.damping[1] = 500
     assert steps.take(scenes, np.array([gain]), np.array([1.0])).all() == (gain > 0.5)

@@ -1,4 +1,4 @@
-"""Steps of Levenberg-Marquardt of a group of scenes, each with its own damping and length."""
+"""Steps of Levenberg-Marquardt of several scenes, each with its own damping and length."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 0.1, 3, 10, 1e3
 PROMISED = 0.5
 # Longest step of a parameter: the quadratic model of chi2 is not valid far from the minimum. After
 # a rejected step it is a quarter of that step, after others twice as long as before, up to this.
-LONGEST_STEP = 1.0
+MAX_STEP = 1.0
 # Largest fraction by which a step lowers ln(1 + 1 / beta), which is 0 for a Gaussian.
-MAX_FALL_OF_WINGS = 0.9
+MAX_WINGS_FALL = 0.9
 
 
 class StepControl:
@@ -25,7 +25,7 @@ class StepControl:
 
     def __init__(self, n_scenes):
         self.damping = np.full(n_scenes, FIRST_DAMPING)
-        self.longest = np.full(n_scenes, LONGEST_STEP)
+        self.longest = np.full(n_scenes, MAX_STEP)
         self._length = np.zeros(n_scenes)
 
     def next(self, scenes, normal, right, theta, galaxies, free=None):
@@ -38,7 +38,7 @@ class StepControl:
         """
         scale, per_scale = wings_scale(theta)
         most = np.full(theta.shape, np.inf)
-        most[..., 3] = np.where(galaxies, MAX_FALL_OF_WINGS * scale * per_scale, np.inf)
+        most[..., 3] = np.where(galaxies, MAX_WINGS_FALL * scale * per_scale, np.inf)
         most, moves = most.reshape(right.shape), np.ones(right.shape, bool)
         if free is not None:
             moves = np.repeat(free, N_PARAMETERS, axis=1)
@@ -60,7 +60,7 @@ class StepControl:
         factor = np.where(gain > 0, factor, DAMPING_INCREASE)
         self.damping[scenes] *= factor
         shorter = self._length[scenes] / 4
-        longer = np.minimum(2 * self.longest[scenes], LONGEST_STEP)
+        longer = np.minimum(2 * self.longest[scenes], MAX_STEP)
         self.longest[scenes] = np.where(gain > 0, longer, shorter)
         return self.damping[scenes] <= MAX_DAMPING
 
