@@ -194,3 +194,18 @@ def test_fits_again_are_from_significant_profiles(grid, present, gain, contamina
     alternatives, fit = grid(gains, contamination)
     alternatives.gain[0] = present
     assert alternatives.best(fit) == (1 + 4 * len(LN_BETA)) * found
+
+
+@pytest.mark.parametrize("snr, n_far", [(14, 0), (0, 4)])
+def test_larger_sizes_are_compared_without_significant_light(fitted, snr, n_far):
+    """Up to 37 times the present size, beside the 35 profiles near it and the present one."""
+    kept = []
+
+    def looked(fit, scenes):
+        kept.append((fit.theta[0, 0, 0], shape_grid._grids(fit, [0])[0].theta))
+
+    fitted(galaxy(2.5, 6.5, snr), looked=looked)
+    (present, theta), near = kept[0], 1 + len(SIZE_STEPS) * len(LN_BETA)
+    steps = shape_grid.FAR_STEPS[:n_far]
+    np.testing.assert_allclose(theta[near:, 0] - present, steps)
+    assert len(theta) == near + n_far and len(SIZE_STEPS) * len(LN_BETA) == 35
