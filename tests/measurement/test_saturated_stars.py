@@ -117,6 +117,18 @@ def test_a_ray_that_alternates_has_no_peaks_and_a_source_on_it_stays():
     assert rest.max() < 5
 
 
+def test_a_galaxy_wider_than_any_source_beyond_a_darker_stretch_stays():
+    y, x = np.indices((151, 151)) - 40.0
+    away = np.hypot(y, x)
+    image = 3000 * np.exp(-away / 11) + np.random.default_rng(1).normal(0, 1, away.shape)
+    galaxy = 30 * np.exp(-((y - 80) ** 2 + (x - 20) ** 2) / (2 * 10**2))
+    star = StarPlace(np.array([40.0, 40.0]), 2.0)
+    rest, own = _without_stars(image + galaxy, image > -1e9, [star], 2.5)
+    bright = own & (galaxy > 15)
+    assert bright.sum() > 400
+    assert np.median(rest[bright] / galaxy[bright]) > 0.5
+
+
 def test_flat_tops_that_nobody_masked_are_cores_too():
     observation = starry()
     unmasked = Observation(
