@@ -8,8 +8,9 @@ is attributed to the star:
 m(r) = max over windows of length L that contain r of the minimum in the window.
 
 A star's light falls outwards. So m(r) is at most `MAX_RISE` times the least m nearer to the star,
-each with `RING_ERROR` of its ring's light, and `RISE_SIGMAS` more: the light of a large galaxy that lies
-beyond a darker stretch stays.
+each with `RING_ERROR` of its ring's light, and `RISE_SIGMAS` more: the light of a large galaxy that
+lies beyond a darker stretch stays.
+
 The remainder of the image is searched, in units of its scatter on the same ring.
 """
 
