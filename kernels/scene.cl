@@ -31,8 +31,9 @@
  *             of n_bands
  * merge_spectra  spectra[s, channel + c] = sum_t shares[s, c, t] parts[s, c, t];  launch: the same
  *
- * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else at least the width of the
- * widest row; of the second axis, which counts rows, any part or more than all may be launched.
+ * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else the width of a row or any
+ * other, since work-items stride over a row; of the second axis, which counts rows, any part or
+ * more than all may be launched.
  */
 #include "contract.h"
 #include "boxes.h"

@@ -16,8 +16,8 @@
  *            data times root
  *
  * whiten   images <- images root;  launch: (X, tallest window, slots)
- * compute_residuals  model m = sky root + sum_slots A images, residual r = data root - m, weight w = 1 /
- *          (1 + (error (light - sky root))^2) where root is not 0, error (B, n_bands);
+ * compute_residuals  model m = sky root + sum_slots A images, residual r = data root - m, weight
+ *          w = 1 / (1 + (error (light - sky root))^2) where root is not 0, error (B, n_bands);
  *          sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]

@@ -13,7 +13,7 @@
  *            them, (1, n_lines, batch / n_bands).
  *
  * rowdot   y[b, p] = sum_x<n T[b, p, x] * E[p, x]        launch: (n_positions rounded up, batch)
- * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, rounded up, batch)
+ * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (elements rounded up, batch)
  *          The two ends of the executor for any positions: each observed pixel p has a table row
  *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero from n on, of which

@@ -48,6 +48,19 @@ class Blend:
             check_instance(f"sources[{i}]", source, Source)
         if self.frame is not None:
             check_instance("frame", self.frame, Frame)
+        n = len(self.sources)
+        if len(self.thetas) not in (0, n):
+            raise ValueError(
+                f"thetas has {len(self.thetas)} entries, must have one for each of {n} sources or "
+                "none: pass Result.thetas of a fit of the same sources"
+            )
+        for i, own in enumerate(self.thetas):
+            for theta in () if own is None else own:
+                if np.ndim(theta) != 1 or not np.isfinite(theta).all():
+                    raise ValueError(
+                        f"thetas[{i}] has {theta}, must have finite parameters (n,) of each "
+                        "component: pass Result.thetas"
+                    )
 
     def _check_work(self, frame):
         """Raises ValueError, before a fit starts, if it would exceed the limits on work."""

@@ -86,7 +86,7 @@ class Fit:
     def patch(self) -> StartInput:
         """Inputs of the start of this fit."""
         i = self.fitted
-        thetas = self.blend.thetas or [None] * len(self.sources)
+        thetas = self.blend.thetas if len(self.blend.thetas) else [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
         return StartInput(self.frame, sources, self._positions[i], self.views, tuple(thetas))
 

@@ -59,8 +59,9 @@ class Settings(FitSettings):
         are not monotone. For other methods see PaperSettings
     loss_tol: a fit has converged when the loss (half chi2) fell by less than `loss_tol` over 5
         iterations, would fall by less than a tenth of that in all further ones if it went on like
-        this (all of it from 50 iterations on, since only fine structure is left), and a joint
-        Newton step would gain less than a fifth of it.
+        this, and a joint Newton step would gain less than a fifth of it. From 50 iterations on,
+        and 10 after the last rejected step, it may instead fall by all of it later, and by twice
+        as much over 10 iterations, since only fine structure is left.
         The limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
         iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
         move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)

@@ -63,7 +63,7 @@ FLAG_MEANINGS = {
     Flag.OUTSIDE_FRAME: "outside the frame, thus not fitted: nothing is measured",
     Flag.CENTER_MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
     Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
-    Flag.MISFIT: "the model leaves over 5 sigma and over 3 % of the flux in a channel",
+    Flag.MISFIT: "the model leaves over 5 sigma (4 beside a point) and over 3 % of the flux",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
 }
 
@@ -107,11 +107,11 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
             channels and with all sources' models
         max_residual_* per channel [sigma]: the largest residual on the source once filtered with
             the PSF, see `residuals.max_filtered_residuals`
-        misfit_sigma [sigma]: the larger of two: the largest of these residuals, and the excess of
-            chi2 of the source's pixels in a channel
+        misfit_sigma [sigma]: the largest of these residuals, of the excess of chi2 of the source's
+            pixels in a channel, and of the light about a point that is wider than the PSF
         misfit_fraction [1]: residual light over flux, in the channel with the largest ratio of
-            those over 5 sigma; 0 if there is none. A source over 5 sigma and over 0.03 is flagged
-            MISFIT, see `Misfit`
+            those over 5 sigma, of wider light over 4; 0 if there is none. A source over that and
+            over 0.03 is flagged MISFIT, see `Misfit`
         ambiguous_with: row of the source whose light cannot be told apart from this source's, see
             `is_ambiguous`; -1 if there is none
     """

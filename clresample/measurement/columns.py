@@ -53,7 +53,7 @@ DEFINITIONS = definitions(
         "e2": "ellipticity of the fitted light: above 0 if stretched north-east - south-west",
         "position_angle": ("of the fitted light's long axis, east of north", u.deg),
         "misfit_sigma": "largest residual, or excess of chi2, in any channel, in sigma",
-        "misfit_fraction": "light that the model leaves over the flux, 0 if under 5 sigma",
+        "misfit_fraction": "light that the model leaves over the flux, 0 if not significant",
         "ambiguous_with": ("id or row of the source that has its light, or -1", None, np.int64),
     }
 )

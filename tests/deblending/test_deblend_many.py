@@ -18,7 +18,7 @@ from clresample.paper.run import FitTrack
 from clresample.paper.settings import PaperSettings
 from clresample.paper.solver.engine import Engine
 from clresample.paper.solver.prior import SingleScalePrior
-from clresample.sky.frame import Frame
+from clresample.sky.frame import Frame, model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -42,7 +42,11 @@ def ragged():
     ]
     alone = blend((CORNER,), seed=6)
     blends.append(replace(alone, observations=alone.observations[:1]))
-    blends.append(replace(blend(GALAXIES, seed=7, shape=(29, 35)), frame=None))
+    framed = blend(GALAXIES, seed=7, shape=(29, 35))
+    grid = model_frame(framed.observations).grid
+    at = [framed.frame.grid.positions_in(grid, *s.position_px) for s in framed.sources]
+    sources = [replace(s, position_px=tuple(p)) for s, p in zip(framed.sources, at, strict=True)]
+    blends.append(replace(framed, sources=tuple(sources), frame=None))
     return blends
 
 

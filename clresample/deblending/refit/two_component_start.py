@@ -119,11 +119,20 @@ def _as_before(point, begin, chosen):
     held = np.flatnonzero(~new & drawn)
     shapes, thetas = list(point.shapes), list(point.thetas)
     places, peaks = point.drawn_positions.copy(), point.peaks.copy()
+    scatter = begin.flux_scatter.copy()
+    scatter[begin.source[list(chosen)]] = 0
     for k in held:
         i = before[k]
         shapes[k], thetas[k] = begin.shapes[i], begin.thetas[i]
         places[k], peaks[k] = begin.drawn_positions[i], begin.peaks[i]
-    return replace(point, shapes=shapes, thetas=thetas, drawn_positions=places, peaks=peaks)
+    return replace(
+        point,
+        shapes=shapes,
+        thetas=thetas,
+        drawn_positions=places,
+        peaks=peaks,
+        flux_scatter=scatter,
+    )
 
 
 def _alone(fit, asked):

@@ -37,9 +37,9 @@ class ProfileFit:
 
     expected, population: PopulationPriors on the parameters, the first and the present one
     source (B, n): to which each component belongs, -1 where there is none
-    theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
+    theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
+        end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of the components, see `thresholds`
-    started (B,): bool, scenes that go on from an earlier fit and are not started a second time
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
@@ -54,7 +54,6 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.started = np.zeros(size[0], bool)
         self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
@@ -70,7 +69,10 @@ class ProfileFit:
         self._measure_brightness(self.theta)  # now with spectra
 
     def run(self):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways."""
+        """Steps until all scenes have ended; starts those with large galaxies in two ways.
+
+        Then sets size and wings of faint galaxies from grids.
+        """
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
         self._step(np.flatnonzero(some), learn=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
@@ -175,7 +177,8 @@ class ProfileFit:
             gain = self._try(scenes, trial[on])
             gained = gain > 0
             live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & (gain < CHI2_TOL))
-            self._take_equations(scenes[gained])
+            if gained.any():
+                self._take_equations(scenes[gained])
             further = scenes[gained & live[scenes]]
             some = further[learning[further]]
             if len(some) and i_step < n_steps - 1:
@@ -256,7 +259,6 @@ def start_from(fit, known):
     grown = _growth(fit)[scenes].max(axis=1) > MAX_GROWTH
     fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
-    fit.started[scenes] = True
 
 
 def _growth(fit):
@@ -267,7 +269,7 @@ def _growth(fit):
 def _may_hold_large_galaxies(fit):
     """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained."""
     unexplained = fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()
-    return ~fit.started & ((_growth(fit).max(axis=1) > MAX_GROWTH) | unexplained)
+    return (_growth(fit).max(axis=1) > MAX_GROWTH) | unexplained
 
 
 def _chi2_as_expected(fit, scenes):

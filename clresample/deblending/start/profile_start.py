@@ -208,11 +208,16 @@ def _components(patches):
 
 
 def _known(patches, components):
-    """Parameters {component: (n,)} of `StartInput.thetas`, of sources with as many components."""
+    """Parameters {component: (n,)} of `StartInput.thetas`, of sources with as many components.
+
+    Of several the most compact one is first, as in `components_of`.
+    """
     known: dict[int, np.ndarray] = {}
     numbers = range(len(components))
     for (b, i), own in groupby(numbers, lambda k: (components[k].scene, components[k].source)):
-        places, before = list(own), (patches[b].thetas and patches[b].thetas[i]) or ()
+        given = patches[b].thetas[i] if len(patches[b].thetas) else None
+        places, before = list(own), () if given is None else list(given)
+        before = sorted(before, key=lambda theta: theta[0]) if len(before) > 1 else before
         sizes = [len(components[k].shape.mean) for k in places]
         if [len(theta) for theta in before] == sizes:
             known |= dict(zip(places, before, strict=True))

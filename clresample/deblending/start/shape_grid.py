@@ -46,8 +46,8 @@ SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.9, -0.1, -1.1, -2
 FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
 # Smallest decrease of chi2 for another fit.
 MIN_GAIN = 1.0
-# Largest number of galaxies of a scene whose grids are rendered at once.
-MAX_AT_ONCE = 8
+# Largest numbers of galaxies of a scene, and of frames' pixels times profiles, rendered at once.
+MAX_AT_ONCE, MAX_PIXELS = 8, 30_000_000
 
 
 def fit_faint_shapes(fit, scenes):
@@ -56,7 +56,7 @@ def fit_faint_shapes(fit, scenes):
     Stores the scatter of their fluxes in its `flux_scatter`.
     """
     grids = _grids(fit, _uncertain(fit, scenes))
-    better = {i: grid.theta[grid.best(fit)] for i, grid in grids.items() if grid.best(fit)}
+    better = {i: grid.theta[k] for i, grid in grids.items() if (k := grid.best(fit))}
     if better:
         changed = _fitted_again(fit, better)
         grids |= _grids(fit, [i for i in grids if fit.looking.scene[i] in changed])
@@ -121,13 +121,17 @@ def _uncertain(fit, scenes):
 
 
 def _grids(fit, components):
-    """The ShapeGrids {component: grid}, of few components of a scene at once."""
-    count, rounds = {}, {}
+    """The ShapeGrids {component: grid}, of few components at once."""
+    rounds, count, n_pixels = [[]], {}, 0
     for i in components:
-        scene = fit.looking.scene[i]
-        count[scene] = count.get(scene, 0) + 1
-        rounds.setdefault((count[scene] - 1) // MAX_AT_ONCE, []).append(i)
-    return {i: grid for some in rounds.values() for i, grid in _computed(fit, some)}
+        own = fit.looking.components[i]
+        n = np.prod(own.frame) * (1 + len(SIZE_STEPS) * len(LN_BETA) + len(FAR_STEPS))
+        if count.get(own.scene, 0) == MAX_AT_ONCE or (rounds[-1] and n_pixels + n > MAX_PIXELS):
+            rounds.append([])
+            count, n_pixels = {}, 0
+        count[own.scene], n_pixels = count.get(own.scene, 0) + 1, n_pixels + n
+        rounds[-1].append(i)
+    return {i: grid for some in rounds if some for i, grid in _computed(fit, some)}
 
 
 def _computed(fit, components):
@@ -155,9 +159,9 @@ def _computed(fit, components):
         off = (off + present * sky[first])[owner]
         part = np.divide(sky, level[owner], out=np.zeros_like(sky), where=level[owner] > 0)
         right, alone = right - part * off, alone - part * sky
-    right = np.maximum(right, 0)
     if looking.ties is not None:
         right, alone = (looking.ties.spread(looking.ties.total(a)) for a in (right, alone))
+    right = np.maximum(right, 0)
     flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
     gain = right * flux if looking.ties is None else (right * flux)[:, looking.ties.first]
     parts = gain.sum(axis=1), flux * _part_inside(listed, theta)[:, None]

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...deblending.blend import Blend
 from ...deblending.spectra import MODEL_ERROR
+from ...deblending.start.equations import N_PARAMETERS
 from ...sky.box import Box, box_within
 from ...sky.frame import model_frame
 from ...sky.sources import ExtendedSource, PointSource
@@ -67,12 +68,13 @@ def listed_source(patch, plan, s):
 def with_profiles(blend, profiles, *, single):
     """A Blend whose sources go on from profiles {id: parameters (n,) of each component}.
 
-    Galaxies with several components keep their number; those with one get n_components=single.
+    Galaxies with several components keep their number; those with one get n_components=single. One
+    that was fitted as a star has no parameters of a galaxy, and its number is open again.
     """
     sources, thetas = [], []
     for source in blend.sources:
         own = profiles.get(int(source.name), ())
-        if own and isinstance(source, ExtendedSource):
+        if own and len(own[0]) == N_PARAMETERS and isinstance(source, ExtendedSource):
             source = replace(source, n_components=len(own) if len(own) > 1 else single)
         sources.append(source)
         thetas.append(own)

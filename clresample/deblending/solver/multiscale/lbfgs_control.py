@@ -25,10 +25,10 @@ FIRST_STRENGTH_ROUND, STRENGTH_ROUNDS, MAX_LOG_STRENGTH_CHANGE = 16, 8, 0.1
 COMMON_ROUNDS = 4
 # The finest structure of sources is tested for significance (evidence.py) once strengths have
 # settled and a scene's loss fell by less than this over the last LOSS_WINDOW iterations, times chi2
-# per pixel as above. `loss_tol` is used if it is larger, so that no scene converges before its
-# test.
-# Before that, structure contains light that later moves to spectra and neighbours: with 5, more
-# simulated galaxies pass. A threshold of 1 selects the same galaxies, up to 30 iterations later.
+# per pixel as above. Twice `loss_tol` is used if it is larger, so that no scene converges before
+# its test. Before that, structure contains light that later moves to spectra and neighbours: with
+# 5, more simulated galaxies pass. A threshold of 1 selects the same galaxies, up to 30 iterations
+# later.
 SIGNIFICANCE_LOSS_DROP = 2.5
 # A scene is also tested after LATE_LOOK rounds if its loss still falls by FALLING and more over
 # these iterations, times chi2 per pixel as above. Losses of large galaxies with clumps fall like
@@ -45,7 +45,7 @@ FIRST_EXCHANGE_ROUND, EXCHANGE_ROUNDS = 40, 20
 # flux errors grow as its square root. The remainder is MAX_REMAINDER while light of neighbours may
 # still move: of four fits of giants with a small galaxy that were continued for 500 rounds, the
 # largest fluxes' changes were 1.0, 0.4, 0.2 and 0.2 errors with 1 in its place, and all below 0.02
-# with 0.1. When exchange directions have moved it for LATE_ROUNDS without a rejected step, what
+# with 0.1. LATE_ROUNDS after exchange directions are first sought, without a rejected step, what
 # still falls is fine structure, and LATE_REMAINDER is enough, of a series of falls over windows of
 # twice as many iterations: changes of nine giants' and pairs' fluxes stay below 0.06 errors, in
 # three quarters of the iterations (bench.ladder, seeds 505 and 6161). With 4 they take two thirds,
@@ -128,7 +128,7 @@ class LbfgsControl:
     def significance_due(self, accepted):
         """Selects scenes (B,) to be tested now for significant structure."""
         fall, chi2 = self._fallen(LOSS_WINDOW), self.chi2()
-        calm = fall < max(SIGNIFICANCE_LOSS_DROP, self.loss_tol) * chi2
+        calm = fall < max(SIGNIFICANCE_LOSS_DROP, 2 * self.loss_tol) * chi2
         far = (self.n_rounds >= LATE_LOOK) & (fall > FALLING * chi2) & np.isfinite(fall)
         return accepted & self.settled & ~self.tested & (calm | far)
 

@@ -139,15 +139,10 @@ class LbfgsSteps:
         own = [(s, some.direction.values) for s, some in enumerate(blocks) if some.direction]
         found = [(scene[s], start[s] + np.arange(len(d)), d) for s, d in own]
         for i, (some, at) in enumerate(zip(exchanges, b.host_first, strict=False)):
-            spectra = np.arange(*self._sizes[i, 1])
-            found += [
-                (
-                    i,
-                    np.concatenate([start[at + d.source] + d.places, spectra]),
-                    np.concatenate([d.values, d.spectra.ravel()]),
-                )
-                for d in some
-            ]
+            for d in some:
+                spectra, moving = d.spectra.ravel(), np.flatnonzero(d.spectra)
+                own = start[at + d.source] + d.places, self._sizes[i, 1][0] + moving
+                found.append((i, np.concatenate(own), np.append(d.values, spectra[moving])))
         self._set_directions(sorted(found, key=lambda direction: direction[0]))
         listed = [(s, block) for s, some in enumerate(blocks) for block in some.blocks]
         self.shelf.retain([block for _, block in listed])
