@@ -8,7 +8,7 @@ is attributed to the star:
 m(r) = max over windows of length L that contain r of the minimum in the window.
 
 A star's light falls outwards. So m(r) is at most `MAX_RISE` times the least m nearer to the star,
-each with `RING_ERROR` of its ring's light, and `RISE_SIGMAS` more: the light of a large galaxy that
+each with `UNEVEN` of its ring's light, and `RISE_SIGMAS` more: the light of a large galaxy that
 lies beyond a darker stretch stays.
 
 The remainder of the image is searched, in units of its scatter on the same ring.
@@ -40,10 +40,9 @@ SOURCE_FWHM = 3.0
 END_SIGMAS, MIN_COVERED_FRACTION = 0.5, 0.25
 SPIKE_REACH = 2.0  # [radii of that ring] radius up to which spikes are removed
 MAX_RISE, RISE_SIGMAS = 1.5, 1.0  # [1], [sigma] of the opened light outwards along a ray
-# [1] of a ring's light, its error on one ray: with 0, spikes near the core are sources, with 0.1,
-# two galaxies of `simulate field --sky bright --size 640`, seed 7, lose more of their light.
-RING_ERROR = 0.01
-UNEVEN = 0.1  # [1] of the opened light: fluctuation of spikes along a ray
+# [1] of a ring's light and of the opened light: their fluctuation along a ray. With 0.01 of a
+# ring's light, a star in DECam images has four false sources, with 0.03 and 0.1 none.
+UNEVEN = 0.1
 # Light alternates along the rows and columns through a core that is smaller than the PSF. Pixels
 # count as dark if a ray has depths of the first number [sigma] below its median beside them, and
 # they are below the second number times that depth. Of 24 peaks along those lines in `simulate
@@ -225,7 +224,7 @@ def _falling(rays, on_rings):
 
     on_rings (radii,): light of the rings, infinite in the core
     """
-    error = RING_ERROR * on_rings[:, None]
+    error = UNEVEN * on_rings[:, None]
     least = np.minimum.accumulate(np.maximum(rays, 0) + error, axis=0)
     found = np.minimum(rays, MAX_RISE * least + RISE_SIGMAS)
     return np.where(np.isfinite(rays), found, 0.0)
