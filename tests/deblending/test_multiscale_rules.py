@@ -216,6 +216,17 @@ def test_scenes_update_strengths_when_due_though_others_do_not(due):
     assert learned == ([due] if any(due) else [])
 
 
+def test_exchange_directions_are_found_after_twice_as_many_rounds_each_time():
+    control, due = begun(1.0, 1.0), []
+    control.live[1] = False
+    for n in range(400):
+        control.n_rounds[:] = n
+        if control.exchanges_due().any():
+            assert control.exchanges_due().tolist() == [True, False]
+            due.append(n)
+    assert due == [40, 80, 160, 320]
+
+
 def test_a_resumed_scene_converges_again_unless_the_step_gains():
     """0.1 and 1 in one step, of which 0.5 are loss_tol; falls before were far larger, then none."""
     control = begun(10, 10)

@@ -94,8 +94,10 @@ class MultiscaleEngine:
         exchanging = p.exchanges_due()
         if exchanging.any():
             found = self.strengths.find_exchanges(exchanging, self.states(exchanging))
+            moved = [bool(now or found.get(i)) for i, now in enumerate(self._exchanges)]
             self._exchanges = [found.get(i, now) for i, now in enumerate(self._exchanges)]
             blocks = self.strengths.schedule.blocks
+            self.pairs.forget(exchanging & moved)  # they are of another inverse curvature
         if blocks is not None:
             self.steps.take_blocks(blocks, self._exchanges)
         sums, slope, loss = self._evaluate()
