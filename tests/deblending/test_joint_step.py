@@ -12,6 +12,7 @@ from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.posterior.joint_step import JointNewtonStep, make_joint_step
 from clresample.deblending.settings import Settings
+from clresample.deblending.solver.multiscale import lbfgs_control
 from clresample.sky.observation import Observation
 
 # Two galaxies of alike colours, each in the other's light, that L-BFGS tells apart slowly.
@@ -136,6 +137,8 @@ def test_what_the_data_do_not_see_stays(device):
 
 
 def test_fits_end_nearer_to_their_minimum(device, monkeypatch):
+    """Without directions of exchange, which do the same after 40 rounds."""
+    monkeypatch.setattr(lbfgs_control, "FIRST_EXCHANGE_ROUND", 10**6)
     end = ended(started(device, CLOSE, loss_tol=0.001, max_iter=400)).fits[0].losses[-1]
     with_steps = ended(started(device, CLOSE, loss_tol=0.2)).fits[0].losses[-1]
     monkeypatch.setattr(loop, "make_joint_step", lambda *given: None)
