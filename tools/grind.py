@@ -182,13 +182,15 @@ def leave(device):
     """One of two scenes goes on alone, its sources in several blocks each."""
     settings, most = Settings(prior=MultiscalePrior()), inverse.MAX_BLOCK_SIZE
     inverse.MAX_BLOCK_SIZE = SMALL_BLOCK
-    fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends(2, _disc())]
-    start_fits(fits)
-    scenes, states = [f.scene for f in fits], [f.state for f in fits]
-    engine = MultiscaleEngine(scenes, states, device, np.float32, settings.prior, 1.0)
-    engine.round()
-    engine.subset([1]).round()
-    inverse.MAX_BLOCK_SIZE = most
+    try:
+        fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends(2, _disc())]
+        start_fits(fits)
+        scenes, states = [f.scene for f in fits], [f.state for f in fits]
+        engine = MultiscaleEngine(scenes, states, device, np.float32, settings.prior, 1.0)
+        engine.round()
+        engine.subset([1]).round()
+    finally:
+        inverse.MAX_BLOCK_SIZE = most
 
 
 def vary(device):

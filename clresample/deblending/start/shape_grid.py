@@ -189,8 +189,7 @@ def _products(around, present, owner, first):
     """
     right, alone, sky = np.zeros((3, len(owner), present.shape[1]))
     is_first = np.isin(np.arange(len(owner)), first)
-    for sight in around.sights:
-        table, _ = sight.overlapping_pairs()
+    for sight, (table, _) in zip(around.sights, around.overlapping_pairs, strict=True):
         one, other = around.at[table[:, :2]].T
         use = (owner[one] == owner[other]) & ((one == other) | is_first[one] | is_first[other])
         one, other, channels = one[use], other[use], sight.channels

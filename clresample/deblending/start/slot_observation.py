@@ -28,7 +28,8 @@ class SlotObservation:
     n_elements: of the last rendered slots; n_pixels: of all products so far
     ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
     sky_precision (B, Co): the views', 0 where they have none
-    root (B, Co, My, Mx): on the device, as are data, residual and weight
+    root (B, Co, My, Mx): on the device, as are data, residual and weight, and, in `_errors`, the
+        scale times each error of the light so far
     """
 
     def __init__(self, views, channels, device, dtype, tuning, precision: Precision, tolerance):
