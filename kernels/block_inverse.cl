@@ -8,10 +8,15 @@
  *
  * apply_block_inverse  H y and H P g_new by blocks, which share no variable; written over the old
  *           values or, with `more`, added to them; launch: (WG, n blocks), groups of (WG, 1)
- * add_directions  d d^T y and d d^T P g_new added to H y and H P g_new for each direction d of n
- *           scenes: scenes (n, 3) int: scene, first direction, last direction + 1;  ends (m + 1,)
- *           int: first of each direction's elements, then the number of all;  places (k,) int and
- *           d (k,): the elements' variables and values;  launch: (WG, n), groups of (WG, 1)
+ *
+ * Directions d of few variables add d d^T to these inverses, the terms of a variable in their order.
+ *   owner     (m,) int: the scene of each direction;  totals (m, 2): d . y and d . P g_new
+ * direction_products  totals, 0 of idle scenes; ends (m + 1,) int: first of each direction's
+ *           elements, then the number of all;  places (k,) int and d (k,): the elements' variables
+ *           and values;  launch: (WG, m), groups of (WG, 1)
+ * add_directions  the directions' terms added to H y and H P g_new, variable by variable:
+ *           variables (n,) int, first (n + 1,) int: of their elements, then the number of all;
+ *           of (k,) int and values (k,): the elements' directions and values;  launch: FOR_I over n
  */
 #include "common.h"
 #include "boxes.h"
@@ -151,28 +156,44 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void add_directions(__global const int *restrict scenes, __global const int *restrict ends,
+void direction_products(__global const int *restrict owner, __global const int *restrict ends,
             __global const int *restrict places, __global const REAL *restrict d,
-            __global const int *restrict plan, const ulong size, __global const REAL *restrict y,
-            __global const REAL *restrict projected, __global REAL *restrict ring_hy,
-            __global REAL *restrict hg_new)
+            __global const int *restrict plan, __global const REAL *restrict y,
+            __global const REAL *restrict projected, __global REAL *restrict totals)
 {
     __local REAL share[2 * WG];
-    const int lid = (int)get_local_id(0), scene = (int)get_global_id(1);
-    const int b = scenes[3 * scene], first = scenes[3 * scene + 1];
+    const int lid = (int)get_local_id(0), k = (int)get_global_id(1);
     /* idle scenes: none, as above */
-    const int last = plan[3 * b] == REST ? first : scenes[3 * scene + 2];
-    __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size;
-    for (int k = first; k < last; ++k) {
-        REAL total[2] = {0, 0};
-        for (int i = ends[k] + lid; i < ends[k + 1]; i += WG) {
-            total[0] += d[i] * y[places[i]];
-            total[1] += d[i] * projected[places[i]];
+    const int end = plan[3 * owner[k]] == REST ? 0 : ends[k + 1];
+    REAL total[2] = {0, 0};
+    for (int i = ends[k] + lid; i < end; i += WG) {
+        total[0] += d[i] * y[places[i]];
+        total[1] += d[i] * projected[places[i]];
+    }
+    GROUP_SUMS(total, 2, lid, share)
+    if (lid == 0) {
+        totals[2 * k] = total[0];
+        totals[2 * k + 1] = total[1];
+    }
+}
+
+__kernel void add_directions(__global const int *restrict variables,
+            __global const int *restrict first, __global const int *restrict of,
+            __global const REAL *restrict values, __global const int *restrict owner,
+            __global const int *restrict plan, const ulong size, const int n,
+            __global const REAL *restrict totals, __global REAL *restrict ring_hy,
+            __global REAL *restrict hg_new)
+{
+    FOR_I(i, n) {
+        const int b = owner[of[first[i]]], at = variables[i];
+        if (plan[3 * b] == REST) continue;
+        __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size;
+        REAL sum_y = hy[at], sum_p = hg_new[at];
+        for (int k = first[i]; k < first[i + 1]; ++k) {
+            sum_y += values[k] * totals[2 * of[k]];
+            sum_p += values[k] * totals[2 * of[k] + 1];
         }
-        GROUP_SUMS(total, 2, lid, share)    /* its SYNC: sums of the direction before are written */
-        for (int i = ends[k] + lid; i < ends[k + 1]; i += WG) {
-            hy[places[i]] += d[i] * total[0];
-            hg_new[places[i]] += d[i] * total[1];
-        }
+        hy[at] = sum_y;
+        hg_new[at] = sum_p;
     }
 }

@@ -29,7 +29,8 @@ class LbfgsSteps:
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._levels, self._directions, self.shelf = [], [], shelf or FactorStore(b.device, b.dtype)
+        self._levels, self._directions = [], None
+        self.shelf = shelf or FactorStore(b.device, b.dtype)
         self._sent = []  # events of uploads that may be on their way
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
@@ -50,13 +51,16 @@ class LbfgsSteps:
             projected=projected,
             hg_new=hg_new,
         )
-        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
-        given = {"plan": self._plan, "size": v.size, "ring_hy": v.hy, "y": y}
-        self._invert, self._add_directions = (
-            b.launcher("block_inverse.cl", name, 2, local_size=size, **macros).bind(
-                **given, projected=projected, hg_new=hg_new
+        macros = {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
+        products = {"plan": self._plan, "y": y, "projected": projected}
+        added = {"plan": self._plan, "size": v.size, "ring_hy": v.hy, "hg_new": hg_new}
+        self._invert, self._multiply_directions, self._add_directions = (
+            b.launcher("block_inverse.cl", name, n_axes, local_size=size, **macros).bind(**given)
+            for name, n_axes, size, given in (
+                ("apply_block_inverse", 2, (group, 1), products | added),
+                ("direction_products", 2, (group, 1), products),
+                ("add_directions", 1, None, added),
             )
-            for name in ("apply_block_inverse", "add_directions")
         )
         self._change = launcher("inner_products").bind(
             **shared, g=v.g, y=y, projected=projected, precision=v.precision, out=self._sums
@@ -102,8 +106,10 @@ class LbfgsSteps:
         self._trial(self._size)
         for size, given in self._levels:
             self._invert(size, **given)
-        for size, given in self._directions:
-            self._add_directions(size, **given)
+        if self._directions is not None:
+            by_direction, by_variable = self._directions
+            self._multiply_directions(by_direction)
+            self._add_directions(by_variable)
         self._change(self._size)
         sums, *others = self._buffers.device.get_all([self._sums, *others])
         self._sent.clear()
@@ -143,7 +149,7 @@ class LbfgsSteps:
                 spectra, moving = d.spectra.ravel(), np.flatnonzero(d.spectra)
                 own = start[at + d.source] + d.places, self._sizes[i, 1][0] + moving
                 found.append((i, np.concatenate(own), np.append(d.values, spectra[moving])))
-        self._set_directions(sorted(found, key=lambda direction: direction[0]))
+        self._set_directions(found)
         listed = [(s, block) for s, some in enumerate(blocks) for block in some.blocks]
         self.shelf.retain([block for _, block in listed])
         for level in range(1 + max((block.level for _, block in listed), default=-1)):
@@ -161,16 +167,29 @@ class LbfgsSteps:
             self._levels.append(((self._size[0], len(own)), given))
 
     def _set_directions(self, directions):
-        """Uploads directions (scene, places (k,), values (k,)), by scene."""
-        b, self._directions = self._buffers, []
-        if directions:
-            owner, places, values = zip(*directions, strict=True)
-            scenes, first = np.unique(owner, return_index=True)
-            ends = np.append(first[1:], len(owner))
-            given = {
-                "scenes": b.device.put(np.stack([scenes, first, ends], axis=1), np.int32),
-                "ends": b.device.put(np.cumsum([0, *map(len, places)]), np.int32),
-                "places": b.device.put(np.concatenate(places), np.int32),
-                "d": b.put(np.concatenate(values)),
-            }
-            self._directions.append(((self._size[0], len(scenes)), given))
+        """Uploads directions (scene, places (k,), values (k,))."""
+        b, self._directions = self._buffers, None
+        if not directions:
+            return
+        scene, places, values = zip(*directions, strict=True)
+        lengths = [len(at) for at in places]
+        places, values = np.concatenate(places), np.concatenate(values)
+        order = np.argsort(places, kind="stable")
+        variables, first = np.unique(places[order], return_index=True)
+        both = {"owner": b.device.put(np.array(scene), np.int32)}
+        both["totals"] = b.device.empty((len(scene), 2), b.dtype)
+        self._multiply_directions.bind(
+            **both,
+            ends=b.device.put(np.cumsum([0, *lengths]), np.int32),
+            places=b.device.put(places, np.int32),
+            d=b.put(values),
+        )
+        self._add_directions.bind(
+            **both,
+            n=len(variables),
+            variables=b.device.put(variables, np.int32),
+            first=b.device.put(np.append(first, len(places)), np.int32),
+            of=b.device.put(np.repeat(np.arange(len(scene)), lengths)[order], np.int32),
+            values=b.put(values[order]),
+        )
+        self._directions = (self._size[0], len(scene)), b.items(len(variables))
