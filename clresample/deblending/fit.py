@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ..device.rounding import round_up
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
 from .component_images import ComponentImages
@@ -276,7 +277,7 @@ def _rendered(fit, seen):
 
 def _padded_frame(frame, pad):
     """The frame with its sides grown to multiples of `pad`, from the same first pixel on."""
-    shape = tuple(-(-n // pad) * pad for n in frame.shape)
+    shape = tuple(round_up(n, pad) for n in frame.shape)
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
 
 

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..device.rounding import round_up
 from ..resampling.cache import cached_resampler
 from ..resampling.resampler import Resampler
 from ..sky.frame import Frame
@@ -236,7 +237,7 @@ def whitened_view(home, observation, pad, device, dtype, *, private) -> Whitened
         share
     """
     observation = observation.whitened
-    shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
+    shape = tuple(round_up(n, pad) for n in observation.data.shape[1:])
     grid = observation.grid
     if shape != observation.data.shape[1:]:
         grid = grid.cutout(0, 0, shape)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .rounding import round_up
 from .tuning import MAX_GROUPS, Tuning
 
 # Kernels: for CPUs, whose tiles are in registers, and for GPUs, whose groups use local memory.
@@ -37,7 +38,7 @@ ONE_SUM = 256
 
 def round_up_columns(n):
     """`n` columns rounded up to whole vectors; elementwise for an array."""
-    return -(-n // COLUMN_PAD) * COLUMN_PAD
+    return round_up(n, COLUMN_PAD)
 
 
 def row_stride(n):
@@ -58,7 +59,7 @@ def terms_per_block(k: int) -> int:
     result is a multiple of TERMS: only the last partial sum of each end has single terms left.
     """
     n_stretches = 2 * max(1, -(-k // (2 * SUM_BLOCK)))
-    return -(-max(math.isqrt(k), -(-k // n_stretches)) // TERMS) * TERMS
+    return round_up(max(math.isqrt(k), -(-k // n_stretches)), TERMS)
 
 
 class MatrixBatch(NamedTuple):
@@ -265,7 +266,7 @@ class BoundContraction:
     def __init__(self, launch, tile, m, extent, tall):
         self.launch, self.m, self.tall = launch, m, tall
         (self.rows, columns, width), self.group_rows = extent, tile["WGY"]
-        self.n_x = _groups(-(-width // columns), tile["WGX"])
+        self.n_x = round_up(-(-width // columns), tile["WGX"])
 
     def __call__(self, batch, *, a=None, c=None):
         """Queues `batch` products.
@@ -290,7 +291,7 @@ class BoundContraction:
             self._launch(m_tall, 1, given | {"m": m_tall})
 
     def _launch(self, m, batch, given):
-        n_y = _groups(-(-m // self.rows), self.group_rows)
+        n_y = round_up(-(-m // self.rows), self.group_rows)
         self.launch((self.n_x, n_y, batch), **given)
 
 
@@ -308,8 +309,3 @@ def box_product(device, dtype, *, strided, ragged, tuning=None):
         ON_CPU=on_cpu,
         **tile,
     )
-
-
-def _groups(n, group):
-    """`n` work-items rounded up to whole groups."""
-    return -(-n // group) * group

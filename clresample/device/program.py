@@ -15,6 +15,7 @@ from .build_lock import build_lock
 from .compiling import CompilationNotice
 from .discovery import DeviceError, load_pyopencl
 from .errors import build_error, float64_error
+from .rounding import round_up
 
 # Types of scalar arguments; REAL is the floating type of a build. All other arguments are buffers.
 SCALARS = {"int": np.int32, "uint": np.uint32, "long": np.int64, "ulong": np.uint64}
@@ -223,7 +224,7 @@ class Launcher:
                     raise
                 raise ValueError(f"{self!r} was not given {', '.join(unset)}") from error
             if self._whole_groups:
-                global_size = tuple([-(-n // g) * g for n, g in zip(global_size, self.local_size)])
+                global_size = tuple(map(round_up, global_size, self.local_size))
             event = self.device.launch(self.kernel, global_size, self.local_size)
         profile = self.device.profile
         if profile is not None:

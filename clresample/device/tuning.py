@@ -12,6 +12,7 @@ import numpy as np
 
 from .gpu_sizes import gpu_sizes, gpu_vendor
 from .pocl_cpu_name import set_pocl_cpu_name
+from .rounding import round_up
 
 # Largest number of groups along the second and third axis of a launch: the limit of NVIDIA's
 # compute capabilities and of Mesa's drivers.
@@ -160,7 +161,7 @@ class Tuning:
 
         def covered(rows):
             group = rows * self.tile["WGY"]
-            return -(-n_rows // group) * group, -rows
+            return round_up(n_rows, group), -rows
 
         choices = {*self.row_choices, self.tile["MR"]}
         if two_sums:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..device.contraction import ImageBatch, MatrixBatch, row_stride
+from ..device.rounding import round_up
 from .executor import Executor
 
 
@@ -108,7 +109,7 @@ def kept_taps(n_taps, n_in, tuning):
 
     If a work-item loops over a line, a multiple of four, unless the line is shorter.
     """
-    return min(-(-n_taps // 4) * 4, n_in) if tuning.row_loops else n_taps
+    return min(round_up(n_taps, 4), n_in) if tuning.row_loops else n_taps
 
 
 class LineInterpolation:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..device.contraction import ImageBatch
+from ..device.rounding import round_up
 from ..device.tuning import Tuning
 from .plan import ResamplingPlan
 from .wave_tables import wave_table
@@ -56,7 +57,7 @@ class FoldedExecutor:
 
     def whole_vectors(self, n):
         """`n` columns rounded up to whole vectors."""
-        return -(-n // self.tuning.tile["VW"]) * self.tuning.tile["VW"]
+        return round_up(n, self.tuning.tile["VW"])
 
     def set_transfer(self, transfer):
         """Sets the transfer functions: a list of one pair D(+,+), D(+,-) (C, Hy, Hx)."""

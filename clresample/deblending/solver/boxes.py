@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from ...device.rounding import round_up
+
 # Elements between possible starts of boxes: the widest OpenCL vector, one 64-byte cache line of
 # float32. Offsets are stored in these units, so that int32 reaches 2^35 elements.
 ALIGN = 16
@@ -51,7 +53,7 @@ class Boxes:
         outside = ((center < 0) | (center >= shape)).any(1)
         _refuse(outside, "center is {} for source {}, outside its box of shape {}", center, shape)
         n_pixels = shape.astype(np.int64).prod(1)
-        end = np.cumsum(-(-n_pixels // ALIGN)) * ALIGN
+        end = np.cumsum(round_up(n_pixels, ALIGN))
         offset = np.concatenate([[0], end])
         if offset[-1] // ALIGN > np.iinfo(np.int32).max:
             raise ValueError(f"shape needs {offset[-1]} elements in all, more than {2**31 * ALIGN}")

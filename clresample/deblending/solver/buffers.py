@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...device.rounding import round_up
 from ...device.tuning import Tuning
 from .boxes import ALIGN, Boxes
 
@@ -124,14 +125,13 @@ class SceneBuffers:
         """A launch for `n` items, several a work-item on CPUs; see FOR_I of work_group.h."""
         if self.tuning.row_loops:
             return (-(-n // ITEMS_EACH),)
-        (group,) = self.tuning.local_size(1)
-        return (-(-n // group) * group,)
+        return (round_up(n, *self.tuning.local_size(1)),)
 
     def sized(self, n_x, n_y, n_z):
         """A launch over rows of n_x pixels, n_y of them, in whole groups of the tuning."""
         group = self.tuning.local_size(3)
         size = self.along_row(n_x), int(n_y), n_z
-        return tuple(-(-n // g) * g for n, g in zip(size, group, strict=True))
+        return tuple(map(round_up, size, group))
 
     def split(self, rows):
         """Arrays (S, ...) of all sources, split by scene."""

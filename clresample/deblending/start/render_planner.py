@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...device.rounding import round_up
 from ...resampling.plan import Precision, ResamplingPlan, make_resampling_plan
 from ...resampling.transfer import light_reach
 from ...sky.mapping import PaddedMapping
@@ -109,7 +110,7 @@ class RenderPlanner:
         size = None
         if len(alike) > 1:
             most = np.max([own[i] for i in alike], axis=0)
-            size = tuple((-(-most // SIZE_PX) * SIZE_PX).tolist())
+            size = tuple(round_up(most, SIZE_PX).tolist())
         plans = [
             self._plans[i].window(shape, self._reach[i], self.precision, size) for i in members
         ]

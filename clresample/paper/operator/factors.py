@@ -12,6 +12,7 @@ from the cache.
 from __future__ import annotations
 
 from ...device.contraction import Contraction, ImageBatch, MatrixBatch, round_up_columns, row_stride
+from ...device.rounding import round_up
 from ...device.tuning import Tuning
 from .launches import PixelLaunches, ShiftLaunches, SlabLaunches
 from .slabs import SHIFT_COST, cut_slabs
@@ -171,4 +172,4 @@ class PaperFactors:
 
     def whole_lanes(self, n) -> int:
         """`n` columns rounded up to whole work-items of shift.cl."""
-        return -(-n // self.tuning.lanes) * self.tuning.lanes
+        return round_up(n, self.tuning.lanes)

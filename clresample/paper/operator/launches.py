@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...device.contraction import BoundContraction, MatrixBatch
+from ...device.rounding import round_up
 from ...device.tuning import Tuning
 
 
@@ -106,7 +107,7 @@ class PixelLaunches:
         spread: the adjoint for one chunk, part (1, n_l, ld) = pixels where covered, else 0
         """
         given = {"ld": ld, "part": part, "covered": self.covered, "n_cols": self.n_cols}
-        whole = -(-ld // self._group) * self._group
+        whole = round_up(ld, self._group)
         collect, spread = (launcher().bind(**given, **self.steps) for launcher in self.launchers)
         return (
             functools.partial(

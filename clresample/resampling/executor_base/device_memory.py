@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 
 from ...device.contraction import ItemSizes, MatrixBatch
+from ...device.rounding import round_up
 from ...device.tuning import Tuning
 
 
@@ -98,7 +99,7 @@ class DeviceMemory:
 
     def whole_groups(self, n):
         """`n` pixels of a line rounded up to whole groups of work-items."""
-        return -(-n // self.tuning.line_group) * self.tuning.line_group
+        return round_up(n, self.tuning.line_group)
 
     def item_sizes(self, **sizes) -> ItemSizes | None:
         """The ItemSizes of products with these sizes of each plan; None if all items share them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....device.rounding import round_up
 from ..boxes import ALIGN
 
 # Ratio of a new array's size to that of the factors, when it must grow; and the smallest used
@@ -50,4 +51,4 @@ class FactorStore:
 
 def _room(block):
     """Number of elements of a CurvatureBlock's factor."""
-    return -(-block.cholesky.size // ALIGN) * ALIGN
+    return round_up(block.cholesky.size, ALIGN)

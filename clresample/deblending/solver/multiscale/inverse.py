@@ -22,6 +22,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack
 
+from ....device.rounding import round_up
 from .evidence import N_FREQUENCIES
 from .prior import kernel_rows
 from .scale_direction import ScaleDirection, scale_coefficients
@@ -273,7 +274,7 @@ def _panels(root):
     Each PANEL of its rows up to the diagonal of the last one, one after the other, with zeros where
     the matrix has ended.
     """
-    m = -(-len(root) // PANEL) * PANEL
+    m = round_up(len(root), PANEL)
     whole = np.zeros((m, m), np.float32)
     whole[: len(root), : len(root)] = root
     panels = [whole[i : i + PANEL, : i + PANEL].ravel() for i in range(0, m, PANEL)]

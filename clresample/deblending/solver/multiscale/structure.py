@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....device.rounding import round_up
 from ..boxes import ALIGN
 
 
@@ -33,7 +34,7 @@ class LatentLayout:
         self.shape = np.stack([coarse_count(boxes.shape, step) for step in steps], axis=1)
         self.shape[np.setdiff1d(np.arange(len(boxes)), free)] = 0
         used = self.shape.prod(2).sum(1)
-        ends = np.cumsum(-(-used // ALIGN) * ALIGN)
+        ends = np.cumsum(round_up(used, ALIGN))
         self.start = np.concatenate([[0], ends])[:-1]
         self.size = int(ends[-1])
 
@@ -80,7 +81,7 @@ class StructureOperator:
         free = b.device.get(b.free)[: b.n_free]
         self.latents = LatentLayout(b.host_boxes, free, prior.steps)
         self.n_scales = len(prior.steps)
-        margin = -(-(max(prior.radii) + max(prior.steps)) // ALIGN) * ALIGN
+        margin = round_up(max(prior.radii) + max(prior.steps), ALIGN)
         n_taps = 2 * max(prior.radii) + 2
         taps = np.zeros((self.n_scales, n_taps))
         for row, kernel, step in zip(taps, prior.kernels(), prior.steps, strict=True):
@@ -95,7 +96,7 @@ class StructureOperator:
         }
         rows = self.latents.shape[:, :, 0].sum(1)
         lines = np.maximum(rows, b.host_boxes.shape[:, 0])  # of condense, and of spread
-        width = -(-b.host_boxes.shape[:, 1] // ALIGN) * ALIGN + 2 * margin + ALIGN
+        width = round_up(b.host_boxes.shape[:, 1], ALIGN) + 2 * margin + ALIGN
         scratch = np.concatenate([[0], np.cumsum(lines * width)])
         line = b.device.zeros(max(int(scratch[-1]), 1) if b.tuning.row_loops else 1, b.dtype)
         start = np.stack([self.latents.start, scratch[:-1]], axis=1) // ALIGN

@@ -15,6 +15,7 @@ import functools
 import numpy as np
 
 from ....device.contraction import ImageBatch
+from ....device.rounding import round_up
 from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
 from ..boxes import Boxes
@@ -45,7 +46,7 @@ class WindowGroups:
         high = np.zeros((len(cells), 2), np.int64)
         np.minimum.at(self.low, group, origin)
         np.maximum.at(high, group, origin + shape)
-        self.shape = -(-(high - self.low).max(axis=0) // ROUND_PX) * ROUND_PX
+        self.shape = round_up((high - self.low).max(axis=0), ROUND_PX)
 
     def __len__(self):
         return len(self.scene)
