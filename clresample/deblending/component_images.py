@@ -104,3 +104,20 @@ def image_within(rendered, i, window):
     if isinstance(rendered, ComponentImages):
         return rendered.within(i, window)
     return rendered[i][:, *window]
+
+
+def local_chi2(observed, views, channels, spectra, residuals):
+    """chi2 per pixel (n,) where each component's light is, by A^2 times its image.
+
+    observed: per view, ComponentImages of n components; channels: slices of the views among all;
+    spectra (n, C): A; residuals: per view (Co, My, Mx)
+    """
+    found, light = np.zeros((2, len(spectra)))
+    for view, rendered, left, part in zip(views, observed, residuals, channels, strict=True):
+        weight, power = view.sqrt_weights**2, spectra[:, part] ** 2
+        chi2 = weight * left**2
+        for i, image in enumerate(rendered.images):
+            image = image * weight[:, *rendered.window(i)]
+            light[i] += power[i] @ image.sum((1, 2))
+            found[i] += power[i] @ (image * chi2[:, *rendered.window(i)]).sum((1, 2))
+    return found / np.maximum(light, 1e-30)

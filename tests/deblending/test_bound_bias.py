@@ -9,9 +9,8 @@ from helpers.scenes import MODEL_PSF
 
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
-from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.component_images import ComponentImages, local_chi2
 from clresample.deblending.posterior.bound_bias import negative_chi2_gradient
-from clresample.deblending.posterior.posterior import _local_chi2
 from clresample.deblending.start.final_render import RenderedModel
 from clresample.measurement.photometry import fluxes
 from clresample.sky.frame import Frame
@@ -114,8 +113,10 @@ def test_chi2_is_that_where_a_components_light_is():
         light = spectra[:, part, None, None] ** 2 * whole * root**2
         wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
     scene = SimpleNamespace(channels=lambda: [slice(0, 1), slice(1, 3)])
-    seen = RenderedModel(spectra, sky, *3 * [None], tuple(seen), ())
-    found = _local_chi2(scene, views, seen, seen.residuals(scene.channels(), views))
+    seen = RenderedModel(spectra, sky, None, tuple(seen), ())
+    found = local_chi2(
+        seen.observed, views, scene.channels(), spectra, seen.residuals(scene.channels(), views)
+    )
     for a, b in zip(residuals, seen.residuals(scene.channels(), views), strict=True):
         np.testing.assert_allclose(a, b)
     np.testing.assert_allclose(found, wanted[0] / wanted[1])

@@ -82,7 +82,6 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
     spectra, sky = np.array([[3.0, 2.0, 1.0], [5.0, 1e-9, 4.0]]), np.array([0.5, -0.25, 0.125])
     low, parts, views, observed = np.array([[0, 0], [2, 3], [2, 3]]), [], [], []
     slope, power, chi2, light = np.zeros((3, 3)), np.zeros((3, 3)), 0.0, 0.0
-    normal, right = np.zeros((3, 4, 4)), np.zeros((3, 4))
     for part in (slice(0, 1), slice(1, 3)):
         parts.append(part)
         n = part.stop - part.start
@@ -94,9 +93,6 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         rest = noise * rng.normal(size=root.shape)
         views.append(SimpleNamespace(sqrt_weights=root, data=model + rest / root))
         whitened = whole * root
-        both = np.concatenate([whitened, root[None]])
-        normal[part] = np.einsum("icyx,jcyx->cij", both, both)
-        right[part] = np.einsum("icyx,cyx->ci", both, model * root + rest)
         slope[:, part] = np.einsum("icyx,cyx->ic", whitened, rest)
         power[:, part] = np.einsum("icyx,icyx->ic", whitened, whitened)
         own = spectra[1, part, None, None] ** 2 * whole[1] * root**2
@@ -108,7 +104,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         scene=SimpleNamespace(channels=lambda: parts),
         ties=None,
     )
-    seen = RenderedModel(None, None, covariance, normal, right, tuple(observed), ())
+    seen = RenderedModel(None, None, covariance, tuple(observed), ())
     asked = colour_gradient._asked(fit, np.array([1]), seen)
     core = np.einsum("cj,jc->c", covariance[:, 2], slope)
     precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)

@@ -161,7 +161,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     """And no less than float64's rounding of the spectrum, 1e-9 of it."""
     made = []
     monkeypatch.setattr(posterior_module, "Posterior", lambda s, *_a, **_k: made.append(s))
-    monkeypatch.setattr(posterior_module, "_local_chi2", lambda *_: np.ones(2))
+    monkeypatch.setattr(posterior_module, "local_chi2", lambda *_: np.ones(2))
     monkeypatch.setattr(posterior_module, "negative_chi2_gradient", lambda *_: [])
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
@@ -171,7 +171,9 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
         settings=Settings(), scene=scene, strength_estimates=1, views=[], start=start, frame=None
     )
     fit.blend = SimpleNamespace(observations=[])
-    seen = SimpleNamespace(spectra=spectra, covariance=covariance, residuals=lambda *_: [])
+    seen = SimpleNamespace(
+        spectra=spectra, covariance=covariance, observed=(), residuals=lambda *_: []
+    )
     _, messages = posterior_module.posterior_of(fit, [], np.ones(2), seen)
     assert messages == []
     wanted = [[1e-4, 3e-9], [2.0, 1e-150]]

@@ -180,7 +180,7 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
         return SimpleNamespace(name=name, views=views, scene=channels, state=state)
 
     def of(change):  # what is seen, with the sky off by so much
-        return RenderedModel(spectra, sky + change, *3 * [None], tuple(observed), ())
+        return RenderedModel(spectra, sky + change, None, tuple(observed), ())
 
     starts, skies = [fit(k) for k in range(3)], [0.5, 1.4, -1.0]
     chi2 = [0.0] * 3

@@ -12,6 +12,7 @@ from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.extended import missed_light
 from ..assessment.status import with_misfit_status
+from ..component_images import local_chi2
 from ..result import noted
 from .aligned_observation import align_observations
 from .block_matrix import BlockCholesky
@@ -253,7 +254,8 @@ def posterior_of(fit, morphs, peaks, seen):
         scene.ties is not None
     ):  # those of one exposure, since each exposure of a band has its own weight
         variance = variance * scene.ties.count
-    residuals = seen.residuals(scene.channels(), fit.views)
+    channels = scene.channels()
+    residuals = seen.residuals(channels, fit.views)
     solution = Solution(
         scene,
         morphs,
@@ -265,7 +267,7 @@ def posterior_of(fit, morphs, peaks, seen):
         fit.start.positions[fit.start.source],
         fit.start.source,
         fit.strength_estimates,
-        _local_chi2(scene, fit.views, seen, residuals),
+        local_chi2(seen.observed, fit.views, channels, spectra, residuals),
         settings.prior,
         negative_chi2_gradient(scene, fit.views, fit.start.source, seen.spectra, residuals),
     )
@@ -275,17 +277,3 @@ def posterior_of(fit, morphs, peaks, seen):
     except np.linalg.LinAlgError:
         why = "their normal matrix is not positive definite"
     return None, [f"errors are those of fixed morphologies: {why}"]
-
-
-def _local_chi2(scene, views, seen, residuals):
-    """chi2 per pixel (n,) where each component's light is, by A^2 times its image."""
-    found, light = np.zeros((2, len(seen.spectra)))
-    observed = zip(views, seen.observed, residuals, scene.channels(), strict=True)
-    for view, rendered, left, part in observed:
-        weight, power = view.sqrt_weights**2, seen.spectra[:, part] ** 2
-        chi2 = weight * left**2
-        for i, image in enumerate(rendered.images):
-            image = image * weight[:, *rendered.window(i)]
-            light[i] += power[i] @ image.sum((1, 2))
-            found[i] += power[i] @ (image * chi2[:, *rendered.window(i)]).sum((1, 2))
-    return found / np.maximum(light, 1e-30)

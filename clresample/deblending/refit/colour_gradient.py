@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.sources import ExtendedSource
-from ..component_images import ComponentImages
+from ..component_images import ComponentImages, local_chi2
 from ..start.final_render import MorphologyModel, render_models
 
 # Relative scatter of the core's spectrum about that of the whole source: 0.3 mag, as between bulges
@@ -104,30 +104,25 @@ def model_of(fit, which=()):
 def _asked(fit, which, seen):
     """Tests the rendered images of `model_of` for second components."""
     spectra, sky, n = fit.state.spectra, fit.state.sky, len(fit.state.morph)
-    alone = np.concatenate([spectra, np.zeros((len(which), len(sky)))])
-    slope, power = seen.residual_products(alone, sky), seen.power
-    chi2, light, bare = np.zeros(len(which)), np.zeros(len(which)), []
-    for view, rendered, part in zip(fit.views, seen.observed, fit.scene.channels(), strict=True):
+    slope, power = np.zeros((2, n + len(which), len(sky)))  # of images with residual, and itself
+    bare, residuals, channels = [], [], fit.scene.channels()
+    for view, rendered, part in zip(fit.views, seen.observed, channels, strict=True):
         bare.append(
             ComponentImages((n, *rendered.shape[1:]), rendered.low[:n], rendered.images[:n])
         )
-        residual = view.sqrt_weights * (view.data - bare[-1].total(spectra[:, part]))
-        residual -= view.sqrt_weights * sky[part, None, None]
-        for k, i in enumerate(which):
+        residuals.append(view.data - bare[-1].total(spectra[:, part]) - sky[part, None, None])
+        for i, image in enumerate(rendered.images):
             window = (slice(None), *rendered.window(i))
-            weight = (
-                spectra[i, part, None, None] ** 2
-                * rendered.images[i]
-                * view.sqrt_weights[window] ** 2
-            )
-            chi2[k] += (weight * residual[window] ** 2).sum()
-            light[k] += weight.sum()
+            weighted = image * view.sqrt_weights[window] ** 2
+            slope[i, part] = (weighted * residuals[-1][window]).sum(axis=(1, 2))
+            power[i, part] = (weighted * image).sum(axis=(1, 2))
+    chi2 = local_chi2(bare, fit.views, channels, spectra, residuals)[which]
     covariance, cores = seen.covariance, power[n:]
     if fit.ties is not None:
         slope, power = fit.ties.total(slope), fit.ties.total(power)
         covariance, spectra = covariance[fit.ties.first], spectra[:, fit.ties.first]
     core, precision = _eliminated(covariance, slope, power, len(which))
-    precision /= np.maximum(chi2 / np.maximum(light, 1e-30), 1)[:, None]
+    precision /= np.maximum(chi2, 1)[:, None]
     error = 1 / np.sqrt(np.maximum(power[which], 1e-30))
     rows = zip(core, precision, np.maximum(spectra[which], error), strict=True)
     return GradientTest(which, np.array([log_evidence_ratio(*row) for row in rows]), cores, bare)

@@ -45,8 +45,6 @@ class RenderedModel:
 
     spectra (n, C), sky (C,): least squares; covariance (C, n, n): of the spectra. In the views'
         units
-    normal (C, n + 1, n + 1), right (C, n + 1): products of the whitened images, and then of a level
-        of 1, with each other and with the data
     observed: per view, ComponentImages (n, Co, My, Mx); unfiltered_views: likewise, None where it
         is the same
     """
@@ -54,20 +52,8 @@ class RenderedModel:
     spectra: np.ndarray
     sky: np.ndarray
     covariance: np.ndarray
-    normal: np.ndarray
-    right: np.ndarray
     observed: tuple[ComponentImages, ...]
     unfiltered_views: tuple
-
-    @property
-    def power(self):
-        """Products (n, C) of the whitened images with themselves."""
-        return np.diagonal(self.normal, axis1=1, axis2=2)[:, :-1].T
-
-    def residual_products(self, spectra, sky):
-        """Products (n, C) of the whitened images with what spectra (n, C), sky (C,) leave."""
-        known = np.concatenate([spectra, sky[None]]).T
-        return (self.right - np.einsum("cij,cj->ci", self.normal, known))[:, :-1].T
 
     def residuals(self, channels, views):
         """Data minus model (Co, My, Mx) of each of the WhitenedViews, in their units.
@@ -134,14 +120,11 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     found = []
     for b in range(len(models)):
         at = looking.scene == b
-        own = np.r_[0 : at.sum(), looking.n_most]
         found.append(
             RenderedModel(
                 looking.spectra[at],
                 looking.sky[b],
                 looking.covariance(b),
-                looking.normal[b][:, own[:, None], own],
-                looking.right[b][:, own],
                 tuple(observed[b]),
                 tuple(bare[b]),
             )
