@@ -21,7 +21,7 @@ STAGES = {
         "deblending.solver.multiscale.strengths:PriorStrengths.request_blocks",
         "deblending.solver.multiscale.strengths:PriorStrengths.take_blocks",
     ),
-    "joint step": ("deblending.iterate:LbfgsRun._exchange",),
+    "joint step": ("deblending.iterate:LbfgsRun._take_joint_steps",),
     "refit": ("deblending.batch:refit_two_components",),
     "render": ("deblending.batch:render_fits",),
     "errors": ("deblending.fit:with_errors",),

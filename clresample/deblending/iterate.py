@@ -72,7 +72,7 @@ class LbfgsRun:
     Boxes are not resized: structure vanishes at their edges together with the profile.
 
     fits (B): in the engine's order
-    exchanges (B): each fit's JointNewtonStep, or None
+    joint_steps (B): each fit's JointNewtonStep, or None
     asked (B, 4): for its last evaluation, the fit's rounds and loss (0 and infinite before), the
         predicted gain, and the number of JointNewtonSteps computed
     stop_for_refit: see `iterate`
@@ -82,14 +82,14 @@ class LbfgsRun:
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
         self.stop_for_refit = takes_over
         if past is None:
-            self.exchanges = [None] * len(fits)
+            self.joint_steps = [None] * len(fits)
             self.asked = np.tile([0, np.inf, 0, 0], (len(fits), 1))
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
             self.engine = MultiscaleEngine(
                 scenes, states, device, dtype, settings.prior, settings.loss_tol
             )
         else:
-            self.engine, self.exchanges, self.asked = past
+            self.engine, self.joint_steps, self.asked = past
 
     @property
     def live(self):
@@ -114,7 +114,7 @@ class LbfgsRun:
             for i in np.flatnonzero(engine.round()):
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
             live &= ~self._handed_over(live & engine.progress.tested & ~looked)
-            self._exchange(live)
+            self._take_joint_steps(live)
         if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
         over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
@@ -159,7 +159,7 @@ class LbfgsRun:
         self.engine.progress.live &= ~which
         return which
 
-    def _exchange(self, which):
+    def _take_joint_steps(self, which):
         """Takes the joint step of those fits (B,) for which it is due, if it gains enough.
 
         Converged fits then continue.
@@ -167,7 +167,7 @@ class LbfgsRun:
         engine, p = self.engine, self.engine.progress
         enough = MIN_JOINT_GAIN * self.settings.loss_tol * p.chi2()
         rounds, loss, promised, made = self.asked.T
-        there = np.array([e is not None for e in self.exchanges])
+        there = np.array([j is not None for j in self.joint_steps])
         due = p.n_rounds >= np.maximum(rounds + JOINT_STEP_ITERATIONS, FIRST_JOINT_STEP)
         with np.errstate(invalid="ignore"):  # fits whose loss was never finite
             fallen = loss - p.loss
@@ -180,15 +180,15 @@ class LbfgsRun:
         new = which & ((made == 0) | old)
         self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, made + new], 1)[which]
         for i in np.flatnonzero(which & failed):
-            self.exchanges[i] = None
+            self.joint_steps[i] = None
         if new.any():
             self._make_joint_steps(new)
-        which &= np.array([e is not None for e in self.exchanges])
+        which &= np.array([j is not None for j in self.joint_steps])
         slopes, steps = engine.slopes(which) if which.any() else (), {}
         for i in np.flatnonzero(which):
-            step, gain = solve_joint_step(self.exchanges[i], slopes[i])
+            step, gain = solve_joint_step(self.joint_steps[i], slopes[i])
             if step is None:
-                self.exchanges[i] = None
+                self.joint_steps[i] = None
             elif gain > enough[i]:
                 steps[i], self.asked[i, 2] = step, gain
         if steps:
@@ -201,7 +201,7 @@ class LbfgsRun:
         def make(i):
             with contextlib.suppress(np.linalg.LinAlgError):
                 given = self.engine.scenes[i], states[i], findings[i]
-                self.exchanges[i] = make_joint_step(self.fits[i], *given)
+                self.joint_steps[i] = make_joint_step(self.fits[i], *given)
 
         map_threads(host_threads(self.device), make, np.flatnonzero(new))
 
@@ -219,7 +219,7 @@ class LbfgsRun:
         if (~self.live).mean() < REPACK_FRACTION:
             return self
         keep = np.flatnonzero(self.live)
-        fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
-        past = self.engine.subset(keep), exchanges, self.asked[keep]
+        fits, joint_steps = ([some[i] for i in keep] for some in (self.fits, self.joint_steps))
+        past = self.engine.subset(keep), joint_steps, self.asked[keep]
         given = fits, self.settings, self.device, self.dtype, past
         return LbfgsRun(*given, takes_over=self.stop_for_refit)

@@ -18,56 +18,56 @@ from clresample.paper import run as paper_run
 
 
 @pytest.fixture(autouse=True)
-def no_exchange(monkeypatch):
+def no_joint_step(monkeypatch):
     """No sources share light."""
     monkeypatch.setattr(module, "make_joint_step", lambda *given: None)
 
 
-def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
+def test_joint_steps_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
     """Of settled fits after FIRST_JOINT_STEP rounds and each EXCHANGE.
 
     Of converged ones at once.
     """
     made, steps, gains = [], [], {"a": 0.2, "b": 0.6, "c": 0.9}
 
-    def exchange_of(fit, scene, state, findings):
+    def joint_step_of(fit, scene, state, findings):
         made.append((fit.name, scene, state, findings))
         return SimpleNamespace(step=lambda x: (x, 0, 0, gains[fit.name]))
 
-    monkeypatch.setattr(module, "make_joint_step", exchange_of)
+    monkeypatch.setattr(module, "make_joint_step", joint_step_of)
     one = learning([39, 39, 12], converged=[False, False, True], loss_tol=2.5, max_iter=200)
     p, every = one.engine.progress, np.ones(3, bool)
     one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
-    one._exchange(every)
+    one._take_joint_steps(every)
     assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
     p.n_rounds += 1
     for known in (p.settled, p.tested):  # strengths, and what is clear
         assert len(made) == 1
         known[:2] = True
-        one._exchange(every)
+        one._take_joint_steps(every)
     assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
     p.chi2, p.n_rounds = (lambda: np.array([0.5, 1.0, 1.0])), p.n_rounds + 20
-    one._exchange(every)
+    one._take_joint_steps(every)
     assert not steps  # the losses are what they were
     p.loss = p.loss - 0.51
     p.n_rounds -= 1
-    one._exchange(np.array([True, True, False]))
+    one._take_joint_steps(np.array([True, True, False]))
     assert not steps  # too early
     p.n_rounds += 1
-    one._exchange(np.array([True, True, False]))
-    one._exchange(every)
+    one._take_joint_steps(np.array([True, True, False]))
+    one._take_joint_steps(every)
     assert steps == [{1: "slopes 1"}, {2: "slopes 2"}] and len(made) == 3
     p.n_rounds += 20
     p.loss, p.chi2 = p.loss - np.array([0, 0.6, 0.1]), lambda: np.full(3, 0.1)
-    one._exchange(every)
+    one._take_joint_steps(every)
     assert steps[2:] == [{1: "slopes 1", 2: "slopes 2"}]
     assert made[3:][0][0] == "c"  # it fell by .1 of .9 that was promised
     p.n_rounds, p.loss = p.n_rounds + 20, p.loss - np.array([0, 0.6, 0.1])
-    one._exchange(every)  # and again, with a new matrix
-    assert steps[3:] == [{1: "slopes 1"}] and one.exchanges[2] is None and len(made) == 4
+    one._take_joint_steps(every)  # and again, with a new matrix
+    assert steps[3:] == [{1: "slopes 1"}] and one.joint_steps[2] is None and len(made) == 4
     p.loss, p.converged = p.loss - 1, every
     one.settings.max_iter = int(p.n_rounds.max()) - 1
-    one._exchange(every)
+    one._take_joint_steps(every)
     assert len(steps) == 4  # at the limit
 
 

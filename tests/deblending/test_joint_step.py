@@ -43,10 +43,10 @@ def near(device):
     running = started(device, CLOSE)
     for _ in range(6):
         running.engine.round()
-    return running, exchange(running)
+    return running, joint_step(running)
 
 
-def exchange(running, i=0):
+def joint_step(running, i=0):
     engine, which = running.engine, np.arange(len(running.fits)) == i
     given = engine.scenes[i], engine.states()[i], engine.findings(which)[i]
     return make_joint_step(running.fits[i], *given)
@@ -132,7 +132,7 @@ def test_what_the_data_do_not_see_stays(device):
         running.engine.round()
     (slopes,) = running.engine.slopes(np.ones(1, bool))
     slopes.spectra[:, 1] = 1e-3  # what rounding may leave
-    _, spectra, _, gain = exchange(running).step(slopes)
+    _, spectra, _, gain = joint_step(running).step(slopes)
     assert not spectra[:, 1].any() and gain < 10
 
 
@@ -153,12 +153,12 @@ def test_fits_go_on_without_a_matrix_that_is_not_positive_definite(device, monke
 
     monkeypatch.setattr(JointNewtonStep, "step", broken)
     running = ended(started(device, CLOSE))
-    assert running.fits[0].status == "converged" and running.exchanges == [None]
+    assert running.fits[0].status == "converged" and running.joint_steps == [None]
 
 
 def test_galaxies_apart_exchange_nothing(device):
     far = [(p, f, 1.0) for p, f in (((8.0, 8.0), (60, 50, 80)), ((22.0, 28.0), (50, 42, 70)))]
-    assert exchange(started(device, far)) is None
+    assert joint_step(started(device, far)) is None
 
 
 def test_a_step_of_one_scene_leaves_the_others(device):
@@ -170,7 +170,7 @@ def test_a_step_of_one_scene_leaves_the_others(device):
     low, high = engine.vectors.parts()[1, 0]
     before = device.get(engine.vectors.d)[low:high]
     (slopes, _) = engine.slopes(np.array([True, False]))
-    *step, _ = exchange(running).step(slopes)
+    *step, _ = joint_step(running).step(slopes)
     engine.step({0: step})
     np.testing.assert_array_equal(device.get(engine.vectors.d)[low:high], before)
     own = device.get(engine.vectors.x_new) - device.get(engine.vectors.x)

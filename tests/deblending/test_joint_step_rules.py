@@ -55,7 +55,7 @@ def posed(bright=10.0):
     return replace(one, fixed_error=np.full((len(BOXES), 3), 0.5))
 
 
-def exchange_at(one, scale=(1.0, 1.0, 1.0), *, fit_sky=True):
+def joint_step_at(one, scale=(1.0, 1.0, 1.0), *, fit_sky=True):
     """The Exchange of a Solution under weights of a sharp noise, each channel's times scale^2."""
     rng = np.random.default_rng(1)
     root = 30 * rng.uniform(0.5, 2, (3, *SHAPE)) * np.array(scale)[:, None, None]
@@ -107,7 +107,7 @@ def test_a_step_leads_to_the_minimum_of_all_that_is_free(fit_sky, monkeypatch):
     factored, factor = [], joint_step.BlockCholesky
     monkeypatch.setattr(joint_step, "BlockCholesky", lambda m: factored.append(m) or factor(m))
     one = posed()
-    found = exchange_at(one, fit_sky=fit_sky)
+    found = joint_step_at(one, fit_sky=fit_sky)
     assert [moves is None for moves in found.moves] == [True, True, False, False]
     for n, bound in ((1, [(0, 1), (2, 0)]), (1, [(0, 1), (2, 0)]), (2, [(1, 2)]), (3, [])):
         slopes = slopes_of(one, seed=len(bound), bound=bound)
@@ -130,7 +130,7 @@ def test_a_channel_that_hardly_weighs_stays(part, stays):
     The level follows by no more than the light that is moved.
     """
     one = posed()
-    found = exchange_at(one, (1.0, part, 1.0))
+    found = joint_step_at(one, (1.0, part, 1.0))
     _, spectra, sky, _ = found.step(slopes_of(one))
     assert (spectra[:, 1] == 0).all() == stays
     assert (abs(sky[1]) < 1e-4) == (stays or part == 1)
@@ -139,7 +139,7 @@ def test_a_channel_that_hardly_weighs_stays(part, stays):
 
 def test_where_nothing_weighs_nothing_moves():
     one = posed()
-    _, spectra, sky, _ = exchange_at(one, (0, 0, 0)).step(slopes_of(one))
+    _, spectra, sky, _ = joint_step_at(one, (0, 0, 0)).step(slopes_of(one))
     assert not spectra.any() and not sky.any()
 
 
@@ -147,7 +147,7 @@ def test_where_nothing_weighs_nothing_moves():
 def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
     """0.3 errors of flux and second moment at fixed morphologies, of all channels together."""
     one = posed(bright)
-    found, n_small = exchange_at(one), 0
+    found, n_small = joint_step_at(one), 0
     for i in (2, 3):
         moves = found.moves[i]
         profile = one.scene.profile[i]
@@ -167,9 +167,9 @@ def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
 
 def test_changes_of_large_shared_parts_are_further_apart(monkeypatch):
     one = posed()
-    counts = [len(moves.weights) for moves in exchange_at(one).moves[2:]]
+    counts = [len(moves.weights) for moves in joint_step_at(one).moves[2:]]
     monkeypatch.setattr(joint_step, "MAX_CHANGES", 4)
-    fewer = [len(moves.weights) for moves in exchange_at(one).moves[2:]]
+    fewer = [len(moves.weights) for moves in joint_step_at(one).moves[2:]]
     assert min(counts) > 4 and 0 < min(fewer) and max(fewer) <= 4
 
 

@@ -29,7 +29,7 @@ def test_fits_with_clear_structure_are_offered_once_it_is_known():
         return np.zeros(3, bool)
 
     one.engine.round, one.stop_for_refit = round_, takes_over
-    one._exchange = lambda which: exchanged.append(which.tolist())
+    one._take_joint_steps = lambda which: exchanged.append(which.tolist())
     one.run()
     assert [name for name, _ in taken] == ["a", "b"]
     assert taken[1][1] == ("scene 1", "state 1", "findings 1", "iteration limit")

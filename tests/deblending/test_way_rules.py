@@ -237,7 +237,7 @@ def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
         one.settings = SimpleNamespace(max_iter=max_iter, fit_shifts=False)
         settled = []
         one.settle = lambda stop, settled=settled: settled.append(stop.tolist())
-        one._exchange = lambda which: None
+        one._take_joint_steps = lambda which: None
         for k in wanted:
             rounds.clear()
             np.testing.assert_array_equal(one.run(), [[3, 4]])

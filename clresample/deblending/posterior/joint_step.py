@@ -212,10 +212,10 @@ def make_joint_step(fit, scene, state, findings):
     return JointNewtonStep(solution, shared, align_observations(fit), fit_sky=fit.settings.fit_sky)
 
 
-def solve_joint_step(exchange, slopes):
+def solve_joint_step(joint_step, slopes):
     """Step and gain of a JointNewtonStep; None, 0 if its matrix is not positive definite."""
     try:
-        *step, gain = exchange.step(slopes)
+        *step, gain = joint_step.step(slopes)
     except np.linalg.LinAlgError:
         return None, 0.0
     return step, gain
