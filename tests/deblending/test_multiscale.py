@@ -10,7 +10,9 @@ from helpers.solver import close, posed, ragged
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.settings import Settings
+from clresample.deblending.solver.multiscale import lbfgs_control, strengths
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
+from clresample.deblending.solver.multiscale.exchange_direction import ExchangeDirection
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.sky.sources import PointSource
 
@@ -84,11 +86,23 @@ def test_losses_fall_and_scenes_are_as_if_alone(build):
         assert min(m.min() for m in state.morph) >= 0
 
 
-def test_a_part_of_a_batch_goes_on_as_if_nothing_had_happened(build):
+def a_direction(scene, state, evidence, strengths):
+    """Of the first source with coefficients, in place of those found."""
+    i = np.flatnonzero(~scene.fixed)[0]
+    values = 1e-3 * np.ones(sum(z.size for z in state.learned.structure[i]))
+    return [ExchangeDirection(i, np.arange(len(values)), values, 1e-2 * state.spectra)]
+
+
+@pytest.mark.parametrize("exchanging", [False, True])
+def test_a_part_of_a_batch_goes_on_as_if_nothing_had_happened(build, monkeypatch, exchanging):
+    if exchanging:
+        monkeypatch.setattr(lbfgs_control, "FIRST_EXCHANGE_ROUND", 8)
+        monkeypatch.setattr(strengths, "find_exchange_directions", a_direction)
     pairs = ragged(build, np.float64)
     whole, cut = made(build, pairs), made(build, pairs)
     for _ in range(20):
         whole.round(), cut.round()
+    assert [bool(some) for some in cut._exchanges] == [exchanging] * 3
     cut = cut.subset(np.array([2, 0]))
     for _ in range(10):
         whole.round(), cut.round()

@@ -14,6 +14,7 @@ from clresample.deblending.solver.multiscale.engine import (
     vector_bytes,
 )
 from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
+from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.lbfgs_steps import AGAIN, NEXT, REST, STAY, TRY
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior, gaussian
 
@@ -194,6 +195,29 @@ def test_scenes_can_be_taken_out_of_a_batch():
     assert control.loss.tolist() == [10, 20, 30]
 
 
+def test_exchange_directions_are_renewed_and_earlier_pairs_dropped():
+    """Of scenes that are due; pairs stay where there were no directions and are none now."""
+    one, taken, n = object.__new__(MultiscaleEngine), [], 4
+    one.pairs, one._exchanges = LbfgsPairs(n, 2), [[], ["old 1"], [], ["old 3"]]
+    one.pairs.take(np.arange(n), np.ones((n, 3)), np.ones((n, 3)))
+    due = np.array([True, True, True, False])
+    found = {0: ["new 0"], 1: [], 2: []}
+    one.progress = SimpleNamespace(n_rounds=np.zeros(n, int), exchanges_due=lambda: due)
+    one.strengths = SimpleNamespace(
+        take_blocks=lambda _: None,
+        find_exchanges=lambda which, states: found if which is due and states is due else None,
+        schedule=SimpleNamespace(blocks="blocks"),
+    )
+    one.states = lambda which: which
+    one.steps = SimpleNamespace(take_blocks=lambda *given: taken.append(given))
+    one._precondition()
+    assert taken == [("blocks", [["new 0"], [], [], ["old 3"]])]
+    assert one.pairs.count.tolist() == [0, 0, 1, 1]
+    due[:] = False
+    one._precondition()
+    assert len(taken) == 1 and one.pairs.count.tolist() == [0, 0, 1, 1]
+
+
 @pytest.mark.parametrize("due", [(True, False), (False, True), (True, True), (False, False)])
 def test_scenes_update_strengths_when_due_though_others_do_not(due):
     one, learned, sums = object.__new__(MultiscaleEngine), [], np.zeros((2, 3, 4))
@@ -202,14 +226,12 @@ def test_scenes_update_strengths_when_due_though_others_do_not(due):
         strengths_due=lambda _: np.array(due),
         significance_due=lambda _: np.zeros(2, bool),
         next_actions=lambda _: (None, None, None),
-        exchanges_due=lambda: np.zeros(2, bool),
-        n_rounds=np.zeros(2, int),
     )
-    one.strengths = SimpleNamespace(take_blocks=lambda _: None)
     one.pairs = SimpleNamespace(
         take=lambda *_: None, forget=lambda _: None, coefficients=lambda *_: (None, None, None)
     )
     one.steps = SimpleNamespace(follow=lambda *_: None, advance=lambda *_: None)
+    one._precondition = lambda: None
     one._evaluate = lambda: (sums, None, None)
     one._learn = lambda which: learned.append(tuple(which.tolist())) or sums
     one.round()

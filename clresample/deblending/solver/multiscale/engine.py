@@ -90,16 +90,8 @@ class MultiscaleEngine:
 
         returns accepted (B,): scenes whose progress.loss is new
         """
-        p, blocks = self.progress, self.strengths.take_blocks(self.progress.n_rounds)
-        exchanging = p.exchanges_due()
-        if exchanging.any():
-            found = self.strengths.find_exchanges(exchanging, self.states(exchanging))
-            moved = [bool(now or found.get(i)) for i, now in enumerate(self._exchanges)]
-            self._exchanges = [found.get(i, now) for i, now in enumerate(self._exchanges)]
-            blocks = self.strengths.schedule.blocks
-            self.pairs.forget(exchanging & moved)  # they are of another inverse curvature
-        if blocks is not None:
-            self.steps.take_blocks(blocks, self._exchanges)
+        p = self.progress
+        self._precondition()
         sums, slope, loss = self._evaluate()
         accepted, stepped = p.accept_trials(loss, slope)
         new = np.flatnonzero(stepped)
@@ -113,6 +105,19 @@ class MultiscaleEngine:
         self.steps.follow(self.pairs, mode)
         self.steps.advance(a, c, scale, length)
         return accepted
+
+    def _precondition(self):
+        """Takes blocks that are made by now, and new directions of exchange where they are due."""
+        blocks = self.strengths.take_blocks(self.progress.n_rounds)
+        exchanging = self.progress.exchanges_due()
+        if exchanging.any():
+            found = self.strengths.find_exchanges(exchanging, self.states(exchanging))
+            moved = [bool(now or found.get(i)) for i, now in enumerate(self._exchanges)]
+            self._exchanges = [found.get(i, now) for i, now in enumerate(self._exchanges)]
+            blocks = self.strengths.schedule.blocks
+            self.pairs.forget(exchanging & moved)  # they are of another inverse curvature
+        if blocks is not None:
+            self.steps.take_blocks(blocks, self._exchanges)
 
     def _evaluate(self):
         """Inner products, slopes and losses at the trials."""
