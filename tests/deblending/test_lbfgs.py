@@ -213,15 +213,15 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     a[:, 4] = c[:, 4] = 0
     a[1, 2:] = c[1, 2:] = 0
     scale, length = rng.uniform(0.5, 1, (2, 3))
-    blocks = random_blocks(m)
-    m.steps.take_blocks(source_blocks(blocks))
+    blocks, exchanges = random_blocks(m), random_exchanges(m)
+    m.steps.take_blocks(source_blocks(blocks), exchanges)
     m.steps.change()
     x, g, hg, d, s, hy = (m.get(k) for k in ("x", "g", "hg", "d", "s", "hy"))
     m.follow([mode, mode, REST])
     m.steps.advance(a, c, scale, length)
     if mode == NEXT:
         x, g = m.host["x_new"], m.host["g_new"]
-        hg = m.apply(np.where(m.held(x, g), 0, g), blocks)
+        hg = m.apply(np.where(m.held(x, g), 0, g), blocks, exchanges)
     if mode in (NEXT, AGAIN):
         b = m.scene
         q = np.einsum("kn,nk->n", hy, a[b]) - hg
