@@ -51,13 +51,11 @@ def find_exchange_directions(scene, state, evidence, strengths):
     evidence (n): SourceEvidence, None of fixed sources; strengths (n, J)
     """
     boxes = [Box.at(low, m.shape) for low, m in zip(scene.origin, state.morph, strict=True)]
-    shines = state.spectra > 0
-    pairs = [
-        (i, j)
-        for i in np.flatnonzero(~scene.fixed).tolist()
-        for j in np.flatnonzero((shines & shines[i]).any(1)).tolist()
-        if i != j and boxes[i].intersection(boxes[j]).area
-    ]
+    low, shines = np.asarray(scene.origin), (state.spectra > 0).astype(np.float32)
+    high = low + [m.shape for m in state.morph]
+    meet = (np.maximum(low[:, None], low) < np.minimum(high[:, None], high)).all(axis=2)
+    meet &= (shines @ shines.T > 0) & ~np.eye(len(low), dtype=bool) & ~scene.fixed[:, None]
+    pairs = np.argwhere(meet).tolist()
     found = [_direction(scene, state, boxes, pair, evidence, strengths) for pair in pairs]
     return [direction for direction in found if direction is not None]
 
