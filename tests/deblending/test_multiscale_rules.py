@@ -249,6 +249,27 @@ def test_exchange_directions_are_found_after_twice_as_many_rounds_each_time():
     assert due == [40, 80, 160, 320]
 
 
+@pytest.mark.parametrize("external", [True, False])
+def test_a_rejected_external_step_does_not_delay_a_late_end(external):
+    """Falls that end a fit 50 rounds after its start, but not soon after a step of its own."""
+    control = begun(10)
+    control.n_rounds[:] = 50
+    if external:
+        control.resume(np.array([True]))
+    accepted, _ = control.accept_trials(np.array([11.0]), np.array([-1.0]))
+    control.next_actions(accepted)
+    control._losses[0, 20::-1] = 10 + np.cumsum([0, *[-0.14] * 10, *[-0.06] * 10])
+    control.loss[:] = control._losses[0, 0]
+    accepted, stepped = control.accept_trials(control.loss - 0.06, np.array([-0.1]))
+    assert accepted.all() and stepped.all()
+    control.next_actions(accepted)
+    assert control.converged.tolist() == [external]
+    control.converged[:], control.live[:], control.n_rounds[:] = False, True, 90
+    control.accept_trials(np.array([11.0]), np.array([-1.0]))
+    control.next_actions(np.array([False]))
+    assert control._refused[0] == 91  # the next step is its own again
+
+
 def test_a_resumed_scene_converges_again_unless_the_step_gains():
     """0.1 and 1 in one step, of which 0.5 are loss_tol; falls before were far larger, then none."""
     control = begun(10, 10)

@@ -82,7 +82,8 @@ class LbfgsControl:
         self._fresh = np.ones(n, bool)  # the trial is at the present point, with a changed loss
         self._bare = np.zeros(n, bool)  # pairs were dropped after a direction without descent
         self._length, self._trials = np.ones(n), np.zeros(n, int)
-        self._refused = np.zeros(n, int)  # the round of the last rejected trial
+        self._refused = np.zeros(n, int)  # the round of the last rejected trial of its own
+        self._external = np.zeros(n, bool)  # the trial is along an external step
         # the last losses, the present one first
         self._losses = np.full((n, 4 * CONVERGENCE_WINDOW + 1), np.inf)
 
@@ -170,6 +171,7 @@ class LbfgsControl:
         A scene that had converged does so again at once, unless the step lowers its loss.
         """
         self._call_back(which)
+        self._external |= which
         self._length[which], self._trials[which] = 1.0, 0
 
     def _call_back(self, which):
@@ -187,11 +189,13 @@ class LbfgsControl:
         self.converged |= accepted & self.settled & calm
         self.live &= ~self.converged
         refused = self.live & ~accepted
-        self._refused[refused] = self.n_rounds[refused]
+        own = refused & ~self._external
+        self._refused[own] = self.n_rounds[own]
         self._trials = np.where(refused, self._trials + 1, 0)
         self._length = np.where(refused, self._length * self._shrink, 1.0)
         lost = refused & (self._uphill | (self._trials >= MAX_TRIALS))
         bare, stuck = lost & ~self._bare, lost & self._bare
+        self._external &= refused & ~bare
         self._length[bare], self._trials[bare] = 1.0, 0
         self._bare = (self._bare & ~accepted) | bare
         # No step lowers the loss any more, because of its rounding errors. Strengths are updated
