@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 # Relative error of a smooth profile's light in a pixel, because of galaxies' structure such as
 # spiral arms or clumps. With larger values faint neighbours absorb less of that structure, and
@@ -13,6 +14,10 @@ MODEL_ERROR = 0.15
 # each gets half of their light. It changes the flux of an isolated source by this fraction; a
 # larger value would share light between neighbours that the data can separate.
 RIDGE = 1e-8
+# [bytes] Matrices that are solved, or made, at a time, of one problem at least: those of a scene of
+# 1000 components take 32 MB in four channels. Smaller portions take longer where there are many
+# small scenes.
+PORTION_BYTES = 1 << 25
 # Largest number of exchanges of whole sets: problems of separable sources take 2 to 5. Those that
 # still change are solved one by one, in some ms for each of 200 unknowns.
 SPECTRUM_ITERATIONS = 10
@@ -28,8 +33,27 @@ def unit_diagonal(normal):
     scale = np.where(seen, size, 1)
     out = normal / scale[..., None] / scale[..., None, :]
     out *= (seen[..., None] & seen[..., None, :]) | np.eye(normal.shape[-1], dtype=bool)
-    out += (RIDGE + ~seen)[..., None] * np.eye(normal.shape[-1])
-    return out, scale, seen
+    return add_diagonal(out, RIDGE + ~seen), scale, seen
+
+
+def add_diagonal(matrix, values):
+    """Adds values (..., n) to the diagonals of matrices (..., n, n), which are returned."""
+    np.einsum("...ii->...i", matrix)[...] += values
+    return matrix
+
+
+def solve_in_place(matrix, right):
+    """x (n,) of a symmetric matrix (n, n), which is overwritten. Raises LinAlgError without one."""
+    _, _, x, info = dgesv(matrix.T, right, overwrite_a=True)
+    if info:
+        raise np.linalg.LinAlgError("the matrix is singular")
+    return x
+
+
+def portions(n, n_bytes):
+    """Slices of n items of `n_bytes` each that have PORTION_BYTES together, or one item."""
+    step = max(1, PORTION_BYTES // max(n_bytes, 1))
+    return [slice(first, min(first + step, n)) for first in range(0, n, step)]
 
 
 def nnls_batch(normal, right, free=None):
@@ -41,6 +65,14 @@ def nnls_batch(normal, right, free=None):
     until both have the right signs, for all problems side by side. With many sources at one
     position this may cycle, in particular if rounding leaves N with negative eigenvalues.
     """
+    out = np.empty_like(right)
+    for at in portions(len(normal), 8 * normal.shape[-1] ** 2):
+        out[at] = _nnls(normal[at], right[at], free)
+    return out
+
+
+def _nnls(normal, right, free):
+    """`nnls_batch` of all problems at once."""
     matrix, scale, seen = unit_diagonal(normal)
     right = np.where(seen, right / scale, 0)
     n_problems, n = right.shape
@@ -89,6 +121,14 @@ def spectrum_covariance(normal):
     its inverse with negative or too small variances, below those with all other unknowns fixed. In
     that case eigenvalues are set to RIDGE at least.
     """
+    out = np.empty_like(normal)
+    for at in portions(len(normal), 8 * normal.shape[-1] ** 2):
+        out[at] = _inverses(normal[at])
+    return out
+
+
+def _inverses(normal):
+    """`spectrum_covariance` of all matrices at once."""
     matrix, scale, seen = unit_diagonal(normal)
     out = np.linalg.inv(matrix)
     variance = np.diagonal(out, axis1=-2, axis2=-1)
@@ -99,10 +139,10 @@ def spectrum_covariance(normal):
         out[wrong] = part @ part.swapaxes(1, 2)
     out = out / scale[..., None] / scale[..., None, :]
     out *= seen[..., None] & seen[..., None, :]
-    return out + np.where(~seen[..., None] & np.eye(normal.shape[-1], dtype=bool), np.inf, 0)
+    return add_diagonal(out, np.where(seen, 0, np.inf))
 
 
 def _masked(matrix, on):
     """Matrices (M, n, n) with only the unknowns `on` (M, n); the others are 0 by 1 x = 0."""
     both = on[:, :, None] & on[:, None, :]
-    return np.where(both, matrix, 0) + (~on)[:, :, None] * np.eye(matrix.shape[-1])
+    return add_diagonal(np.where(both, matrix, 0), ~on)

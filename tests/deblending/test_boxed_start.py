@@ -62,7 +62,7 @@ def test_slopes_of_chi2(device, monkeypatch):
     fit._look(every, fit.theta, slopes=True)
     fit.looking.compute_residuals(0.0)
     fit._take_equations(every)
-    right = fit._equations(every)[1][0]
+    right = fit._equations(every)[2][0]
     assert (fit.looking.spectra > 0).all()  # no spectrum is held at zero
     step = 1e-4
     for i, unit in enumerate(step * np.eye(used.size).reshape(-1, *used.shape)):

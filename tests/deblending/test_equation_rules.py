@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from clresample.deblending import spectra as spectra_module
 from clresample.deblending.spectra import RIDGE
-from clresample.deblending.start import equations, linearised_scenes as module
+from clresample.deblending.start import linearised_scenes as module
 from clresample.deblending.start.equations import normal_equations
 from clresample.deblending.start.linearised_scenes import LinearisedScenes
 
@@ -191,7 +192,7 @@ def test_parameters_have_the_normal_equations_of_gauss_and_newton(
     Slopes that a component does not have are 0. Images of unit integral are far smaller than a
     level of 1, whose curvature is no measure of theirs. Channels come together or one by one.
     """
-    monkeypatch.setattr(equations, "PORTION_BYTES", portion)
+    monkeypatch.setattr(spectra_module, "PORTION_BYTES", portion)
     one, rng, error = posed(fit_sky), np.random.default_rng(6), 0.1
     for sight in one.sights:
         sight.images *= size

@@ -7,12 +7,16 @@ from clresample.deblending.start.step_control import MAX_STEP, StepControl
 
 
 def first_step(right, theta=(0, 0, 0, 1.5), *, normal=None, galaxy=True, free=None, damping=0.0):
-    """Trial (4,), gains of the whole step and of the one taken; for one galaxy or star."""
+    """Trial (4,), gains of the whole step and of the one taken; for one galaxy or star.
+
+    normal (4, 4): with a prior of 0.25
+    """
     steps = StepControl(1)
     steps.damping[:] = damping
     normal = np.eye(4) if normal is None else normal
-    given = normal[None], np.array([right], float), np.array([[theta]], float), np.array([[galaxy]])
-    trial, *gains = steps.next(np.zeros(1, int), *given, free)
+    equations = [normal - 0.25 * np.eye(4)], np.full((1, 4), 0.25), np.array([right], float)
+    given = np.array([[theta]], float), np.array([[galaxy]])
+    trial, *gains = steps.next(np.zeros(1, int), *equations, *given, free)
     return trial[0, 0], *(float(g[0]) for g in gains)
 
 
@@ -76,7 +80,7 @@ def test_damping_follows_the_gain(gain, factor, longest):
     scenes, before = np.array([1]), steps.damping.copy()
     zero = np.zeros((1, 1, 4))
     right = np.array([[0.4 * (1 + before[1]), 0, 0, 0]])
-    steps.next(scenes, np.eye(4)[None], right, zero, np.array([[False]]))
+    steps.next(scenes, np.eye(4)[None], zero[0], right, zero, np.array([[False]]))
     assert steps.take(scenes, np.array([gain]), np.array([1.0])).all()
     np.testing.assert_allclose(steps.damping, before * [1, factor])
     np.testing.assert_allclose(steps.longest, [MAX_STEP, longest])

@@ -5,14 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..solver.rendering.ties import without_level
-from ..spectra import RIDGE
+from ..spectra import RIDGE, add_diagonal, portions
 
 # Largest number of parameters of a component; others are padded.
 N_PARAMETERS = 4
-# [bytes] Products of spectra and parameters that are made at a time, of one channel at least: those
-# of a scene of 1000 components take 32 MB a channel. Smaller portions take longer where there are
-# many small scenes.
-PORTION_BYTES = 1 << 25
 
 
 def normal_equations(looking):
@@ -23,16 +19,14 @@ def normal_equations(looking):
     """
     k, n, p, ties = len(looking.scenes), looking.n_most, N_PARAMETERS, looking.ties
     normal, right, tied = np.zeros((k, n, p, n, p)), np.zeros((k, n, p)), None
-    portion = max(1, PORTION_BYTES // (k * (n + 1) * n * p * 8))
     levels = looking.of_level() if looking.fit_sky else None
     lit = looking.solution() > 0
     for sight, (table, on_device) in zip(looking.sights, looking.overlapping_pairs, strict=True):
         products = ImageProducts(looking, sight, table, on_device, p)
         products.add_parameters(normal, right)
-        for first in range(sight.channels.start, sight.channels.stop, portion):
-            channels = np.arange(first, min(first + portion, sight.channels.stop))
+        for part, channels in products.portions(k * (n + 1) * n * p * 8):
             own = None if levels is None else [x[:, channels] for x in levels]
-            parts = products.with_spectra(channels - sight.channels.start, own)
+            parts = products.with_spectra(part, own)
             if own is not None:
                 parts = _without_levels(normal, right, *parts)
             parts = [*parts, lit[:, channels, :n]]
@@ -59,9 +53,16 @@ class ImageProducts:
         self._k, self._p = len(looking.scenes), p
         self._gram, self._pull = sight.gram(on_device, 1 + p), sight.residual_products(1 + p)
         self._one, self._other = table[:, :2].T
+        self._channels = sight.channels
         known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
         a = looking.spectra[looking.at][:, sight.channels]
         self._slopes = a[..., None] * known[:, None]  # by which those of a profile are multiplied
+
+    def portions(self, n_bytes):
+        """Pairs of slices, of the observation's and of all channels, of `n_bytes` a channel."""
+        start = self._channels.start
+        for part in portions(self._gram.shape[1], n_bytes):
+            yield part, slice(start + part.start, start + part.stop)
 
     def add_parameters(self, normal, right):
         """Adds the products of slopes to normal (k, n, p, n, p), with the residual to right."""
@@ -73,7 +74,7 @@ class ImageProducts:
         right[self._rows, self._own] += (self._slopes * self._pull[:, :, 1:, 0]).sum(axis=1)
 
     def with_spectra(self, part, levels):
-        """Products of the spectra of some of the observation's channels, `part` (c,) or a slice.
+        """Products of the spectra of some of the observation's channels, a slice.
 
         With each other (k, c, n, n), with the parameters (k, c, n, n, p), with the residual
         (k, c, n). If levels (k, c) are given, their right sides and curvatures, a level is the last
@@ -108,7 +109,7 @@ def _without_levels(normal, right, inner, cross, rest):
     k, c, m, n, p = cross.shape
     by_level, curvature = cross[:, :, -1].reshape(k, c, n * p), inner[..., -1:, -1]
     over = np.divide(by_level, curvature, where=curvature > 0, out=np.zeros_like(by_level))
-    normal -= (by_level.swapaxes(1, 2) @ over).reshape(normal.shape)
+    _subtract_product(normal, by_level, over)
     right -= np.einsum("kcip,kc->kip", cross[:, :, -1], value)
     return gram, cross[:, :, :-1] - share[..., None, None] * cross[:, :, -1:], pull
 
@@ -122,9 +123,16 @@ def _eliminate(normal, right, inner, cross, rest, lit):
     k, n_channels, m, n, p = cross.shape
     cross, rest = cross.reshape(k, n_channels, m, n * p) * lit[..., None], rest * lit
     inner = inner * lit[..., None] * lit[..., None, :]
-    ridge = RIDGE * np.trace(inner, axis1=2, axis2=3)[..., None] + ~lit
-    inner += ridge[..., None] * np.eye(m)
+    add_diagonal(inner, RIDGE * np.trace(inner, axis1=2, axis2=3)[..., None] + ~lit)
     solved = np.linalg.solve(inner, cross)
     for c in range(n_channels):
-        normal -= (cross[:, c].swapaxes(1, 2) @ solved[:, c]).reshape(normal.shape)
+        _subtract_product(normal, cross[:, c], solved[:, c])
     right -= np.einsum("kcmp,kcm->kp", solved, rest).reshape(right.shape)
+
+
+def _subtract_product(normal, left, right):
+    """Subtracts left^T right from normal (k, n, p, n, p); left, right (k, m, n p)."""
+    size = left.shape[2]
+    matrix = normal.reshape(len(normal), size, size)
+    for rows in portions(size, 8 * len(normal) * size):
+        matrix[:, rows] -= left[:, :, rows].swapaxes(1, 2) @ right

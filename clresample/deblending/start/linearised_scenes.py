@@ -126,12 +126,15 @@ class LinearisedScenes:
         then of a level of 1, with each other and with the data
         """
         self.compute_residuals(error)
-        parts, levels = [], self.of_level()
+        k, m, levels = len(self.scenes), self.n_most + 1, self.of_level()
+        self.normal = np.zeros(0)  # before there are others
+        self.normal, self.right = (np.empty((k, self.n_channels, *size)) for size in ((m, m), (m,)))
         for sight, pairs in zip(self.sights, self.overlapping_pairs, strict=True):
-            own = [x[:, sight.channels] for x in levels]
-            parts.append(ImageProducts(self, sight, *pairs).with_spectra(slice(None), own)[::2])
-        self.normal, right = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-        self.right = right + np.einsum("kcij,kcj->kci", self.normal, self.solution())
+            products = ImageProducts(self, sight, *pairs)
+            for part, channels in products.portions(8 * k * m**2):
+                found = products.with_spectra(part, [x[:, channels] for x in levels])
+                self.normal[:, channels], _, self.right[:, channels] = found
+        self.right += np.einsum("kcij,kcj->kci", self.normal, self.solution())
         found = self._non_negative()
         self.spectra[self.at] = found[self.rows, :, self.index[self.at]]
         if self.fit_sky:
@@ -190,8 +193,8 @@ class LinearisedScenes:
             return _by_band(self)
         size = self.n_most + self.fit_sky
         free = np.arange(size) >= self.n_most
-        normal = self.normal[..., :size, :size].reshape(-1, size, size)
-        found = nnls_batch(normal, self.right[..., :size].reshape(-1, size), free)
+        normal, right = (a.reshape(-1, *a.shape[2:])[:, :size] for a in (self.normal, self.right))
+        found = nnls_batch(normal[..., :size], right, free)
         return found.reshape(len(self.scenes), self.n_channels, size)
 
     def covariance(self, row):

@@ -128,12 +128,10 @@ class PopulationPrior:
     def update(self, scenes, theta, normal):
         """Updates the prior of some scenes from their galaxies.
 
-        theta (B, n, p); normal (B, n p, n p): of their equations, with the prior
+        theta (B, n, p); normal (k, n, p, p): of each one's equations, with the prior
         """
-        scenes = scenes[self._several[scenes]]
-        n, p = theta.shape[1:]
-        each = normal[scenes].reshape(-1, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
-        variance = np.diagonal(np.linalg.inv(each), axis1=2, axis2=3).swapaxes(0, 1)
+        normal, scenes = normal[self._several[scenes]], scenes[self._several[scenes]]
+        variance = np.diagonal(np.linalg.inv(normal), axis1=2, axis2=3)
         # equivalent to dividing the data's precision, instead of multiplying the prior's
         variance = variance * self.contamination[scenes][..., None]
         off, known = theta[scenes][..., LEARNED] - self._before[scenes], self._known[scenes]
@@ -155,7 +153,7 @@ def contamination_factors(normal, spectra, source, own_light=OWN_LIGHT):
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
     source (k, n): to which each belongs
     """
-    light = (spectra[:, :, :, None] * normal * spectra[:, :, None]).sum(axis=1)
+    light = np.einsum("kci,kcij,kcj->kij", spectra, normal, spectra)
     own = np.einsum("kii->ki", light)
     # products of separate sources may be negative by rounding
     light = np.maximum(light, 0) * (source[:, :, None] != source[:, None])

@@ -6,7 +6,7 @@ from copy import deepcopy
 
 import numpy as np
 
-from ..spectra import MODEL_ERROR
+from ..spectra import MODEL_ERROR, add_diagonal
 from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
 from .first_profiles import GROWTH, NEED, first_profiles
@@ -213,9 +213,7 @@ class ProfileFit:
     def _learn(self, scenes):
         """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
-        normal = np.zeros_like(self.normal)
-        normal[scenes] = self._equations(scenes)[0]
-        self.population.update(scenes, self.theta, normal)
+        self.population.update(scenes, self.theta, self.own_equations(scenes))
         self._doubt(scenes)
         increase = self.population.penalty(scenes, self.theta) - before
         self.chi2[scenes] += increase
@@ -236,12 +234,17 @@ class ProfileFit:
         self.normal[scenes], self.right[scenes] = normal[rows], right[rows]
 
     def _equations(self, scenes):
-        """Normal matrices and right sides of some scenes, priors included, and their parameters."""
-        right = self.right[scenes]
-        weight = self.population.precision(scenes, self.theta).reshape(right.shape)
+        """Equations of some scenes, as `StepControl.next` takes them."""
+        right, normal = self.right[scenes], [self.normal[b] for b in scenes]
+        prior = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
-        normal = self.normal[scenes] + weight[..., None] * np.eye(right.shape[1])
-        return normal, right + weight * away.reshape(right.shape), self.theta[scenes]
+        return normal, prior, right + prior * away.reshape(right.shape), self.theta[scenes]
+
+    def own_equations(self, scenes):
+        """Normal matrices (k, n, 4, 4) of each component of some scenes alone, prior included."""
+        n, p = self.theta.shape[1:]
+        own = np.einsum("biqir->biqr", self.normal.reshape(-1, n, p, n, p))[scenes]
+        return add_diagonal(own, self.population.precision(scenes, self.theta))
 
     def _measure_brightness(self, theta):
         """Stores the components' peaks over a model pixel's noise, in their best channel."""

@@ -109,10 +109,8 @@ class ShapeGrid:
 
 def _uncertain(fit, scenes):
     """Galaxies in some scenes (k,) whose sizes have large errors, as a list of components."""
-    k, (n, p) = len(scenes), fit.theta.shape[1:]
-    each = fit._equations(scenes)[0].reshape(k, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
     uncertain = np.zeros(fit.source.shape, bool)
-    uncertain[scenes] = np.linalg.inv(each)[..., 0, 0].T > MIN_SIZE_ERROR**2
+    uncertain[scenes] = np.linalg.inv(fit.own_equations(scenes))[..., 0, 0] > MIN_SIZE_ERROR**2
     return [
         i
         for i, c in enumerate(fit.looking.components)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..spectra import solve_in_place
 from .equations import N_PARAMETERS
 
 # Damping of the first step relative to the normal matrix's diagonal, its divisor after a step with
@@ -28,13 +29,14 @@ class StepControl:
         self.longest = np.full(n_scenes, MAX_STEP)
         self._length = np.zeros(n_scenes)
 
-    def next(self, scenes, normal, right, theta, galaxies, free=None):
+    def next(self, scenes, normal, prior, right, theta, galaxies, free=None):
         """Parameters (k, n, 4) of the next trial of some scenes.
 
         Also the gains (k,) in chi2 that are expected of whole steps and of those that are taken.
 
-        normal (k, P, P), right (k, P), theta (k, n, 4): their equations and parameters; galaxies
-            (k, n): those with wings; free (k, n): the components that move, None for all
+        normal (k): arrays (P, P), prior (k, P): added to their diagonals, right (k, P), theta
+            (k, n, 4): their equations and parameters; galaxies (k, n): those with wings; free
+            (k, n): the components that move, None for all
         """
         scale, per_scale = wings_scale(theta)
         most = np.full(theta.shape, np.inf)
@@ -42,15 +44,15 @@ class StepControl:
         most, moves = most.reshape(right.shape), np.ones(right.shape, bool)
         if free is not None:
             moves = np.repeat(free, N_PARAMETERS, axis=1)
-        damping = self.damping[scenes]
-        whole = _bounded(normal, right, damping, moves, most).reshape(theta.shape)
+        given = normal, prior, right, self.damping[scenes], moves, most
+        whole = np.array([_bounded(*own) for own in zip(*given, strict=True)]).reshape(theta.shape)
         longest = self.longest[scenes, None, None]
         step = np.clip(whole, -longest, longest)
         self._length[scenes] = np.abs(step).max(axis=(1, 2))
         trial = theta + step
         wings = -np.log(np.expm1(scale - step[..., 3] / per_scale))
         trial[..., 3] = np.where(galaxies, wings, trial[..., 3])
-        gains = [gain_of(normal, right, s.reshape(right.shape)) for s in (whole, step)]
+        gains = [_gain(normal, prior, right, s.reshape(right.shape)) for s in (whole, step)]
         return trial, *gains
 
     def take(self, scenes, gain, promised):
@@ -65,14 +67,17 @@ class StepControl:
         return self.damping[scenes] <= MAX_DAMPING
 
 
-def _bounded(normal, right, damping, moves, most):
-    """Damped steps (k, P) of those that move (k, P), with those beyond `most` (k, P) held there."""
-    own, held = np.eye(right.shape[1]), np.zeros_like(right)
+def _bounded(normal, prior, right, damping, moves, most):
+    """Damped step (P,) of those that move (P,), with those beyond `most` (P,) held there.
+
+    normal (P, P), prior (P,), right (P,), damping: of one scene
+    """
+    held, diagonal = np.zeros_like(right), (np.diagonal(normal) + prior) * (1 + damping)
     for _ in range(2):
-        matrix = normal * (moves[:, None] & moves[..., None])
-        diagonal = np.diagonal(matrix, axis1=1, axis2=2) * damping[:, None] + ~moves
-        away = (right - np.einsum("kij,kj->ki", normal, held)) * moves
-        step = np.linalg.solve(matrix + diagonal[..., None] * own, away[..., None])[..., 0] + held
+        matrix = normal * (moves & moves[:, None])
+        np.einsum("ii->i", matrix)[:] = np.where(moves, diagonal, 1)
+        away = (right - normal @ held - prior * held) * moves
+        step = solve_in_place(matrix, away) + held
         beyond = step > most
         if not beyond.any():
             break
@@ -89,6 +94,7 @@ def wings_scale(theta):
     return np.log1p(1 / beta), 1 + beta
 
 
-def gain_of(normal, right, step):
+def _gain(normal, prior, right, step):
     """Fall (k,) of chi2 by steps (k, P), to second order, from equations as of StepControl."""
-    return 2 * (step * right).sum(axis=1) - np.einsum("ki,kij,kj->k", step, normal, step)
+    curvature = [s @ (own @ s) for own, s in zip(normal, step, strict=True)]
+    return 2 * (step * right).sum(axis=1) - (prior * step**2).sum(axis=1) - curvature
