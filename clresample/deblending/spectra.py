@@ -56,10 +56,10 @@ def portions(n, n_bytes):
     return [slice(first, min(first + step, n)) for first in range(0, n, step)]
 
 
-def nnls_batch(normal, right, free=None):
+def nnls_batch(normal, right):
     """x (M, n) >= 0 that minimises 1/2 x N x - x r; 0 where N is 0.
 
-    normal N (M, n, n), right r (M, n); free (n,): bool, those that may be negative
+    normal N (M, n, n), right r (M, n)
 
     Block principal pivoting (Kim and Park 2011): sets of unknowns at 0 and off it are exchanged
     until both have the right signs, for all problems side by side. With many sources at one
@@ -67,16 +67,15 @@ def nnls_batch(normal, right, free=None):
     """
     out = np.empty_like(right)
     for at in portions(len(normal), 8 * normal.shape[-1] ** 2):
-        out[at] = _nnls(normal[at], right[at], free)
+        out[at] = _nnls(normal[at], right[at])
     return out
 
 
-def _nnls(normal, right, free):
+def _nnls(normal, right):
     """`nnls_batch` of all problems at once."""
     matrix, scale, seen = unit_diagonal(normal)
     right = np.where(seen, right / scale, 0)
     n_problems, n = right.shape
-    free = np.zeros(n, bool) if free is None else free
     off, x = np.ones((n_problems, n), bool), np.zeros((n_problems, n))
     rounding = 1e-10 * np.abs(right).max(axis=1, initial=0)[:, None]
     going = np.arange(n_problems)
@@ -84,19 +83,18 @@ def _nnls(normal, right, free):
         on = off[going]
         found = np.linalg.solve(_masked(matrix[going], on), (right[going] * on)[..., None])[..., 0]
         slope = np.einsum("mij,mj->mi", matrix[going], found) - right[going]
-        wrong = np.where(on, found < 0, slope < -rounding[going]) & ~free
+        wrong = np.where(on, found < 0, slope < -rounding[going])
         x[going] = np.where(on, found, 0)
         off[going] ^= wrong
         going = going[wrong.any(axis=1)]
         if not len(going):
             break
     for i in going:
-        x[i] = _by_active_sets(matrix[i], right[i], free)
-    x[:, ~free] = np.maximum(x[:, ~free], 0)
-    return np.where(seen, x / scale, 0)
+        x[i] = _by_active_sets(matrix[i], right[i])
+    return np.where(seen, np.maximum(x, 0) / scale, 0)
 
 
-def _by_active_sets(matrix, right, free):
+def _by_active_sets(matrix, right):
     """x (n,) of one problem with a unit diagonal, by Lawson and Hanson's method, which ends.
 
     Eigenvalues are at least RIDGE, as in `spectrum_covariance`.
@@ -106,12 +104,7 @@ def _by_active_sets(matrix, right, free):
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, RIDGE))
     images, data = root[:, None] * vectors.T, vectors.T @ right / root
-    any_sign, _ = np.linalg.qr(images[:, free])  # their span is removed from the others
-    others = images[:, ~free] - any_sign @ (any_sign.T @ images[:, ~free])
-    x = np.zeros(len(right))
-    x[~free], _ = nnls(others, data - any_sign @ (any_sign.T @ data), maxiter=30 * len(right))
-    x[free] = np.linalg.lstsq(images[:, free], data - images @ x, rcond=None)[0]
-    return x
+    return nnls(images, data, maxiter=30 * len(right))[0]
 
 
 def spectrum_covariance(normal):

@@ -135,10 +135,13 @@ class LinearisedScenes:
                 found = products.with_spectra(part, [x[:, channels] for x in levels])
                 self.normal[:, channels], _, self.right[:, channels] = found
         self.right += np.einsum("kcij,kcj->kci", self.normal, self.solution())
-        found = self._non_negative()
+        normal, right, own, value = self._band_equations()
+        n = self.n_most
+        found = nnls_batch(normal.reshape(-1, n, n), right.reshape(-1, n)).reshape(right.shape)
+        found = self._spread(found, axis=1)
         self.spectra[self.at] = found[self.rows, :, self.index[self.at]]
         if self.fit_sky:
-            self.sky[self.scenes] = found[..., self.n_most]
+            self.sky[self.scenes] = value - (own * found).sum(axis=-1)
 
     def with_components(self, components) -> LinearisedScenes:
         """The same observations with other components."""
@@ -187,35 +190,16 @@ class LinearisedScenes:
         out[..., self.n_most] = self.sky[self.scenes]
         return out
 
-    def _non_negative(self):
-        """The least squares (k, C, n) or, with the sky, (k, C, n + 1)."""
-        if self.ties is not None:
-            return _by_band(self)
-        size = self.n_most + self.fit_sky
-        free = np.arange(size) >= self.n_most
-        normal, right = (a.reshape(-1, *a.shape[2:])[:, :size] for a in (self.normal, self.right))
-        found = nnls_batch(normal[..., :size], right, free)
-        return found.reshape(len(self.scenes), self.n_channels, size)
+    def _band_equations(self, rows=slice(None)):
+        """`band_equations` of the scenes rendered last, or of some rows of them."""
+        return band_equations(self.ties, self.normal[rows], self.right[rows], self.fit_sky)
+
+    def _spread(self, values, axis):
+        """Values of bands for all channels, see Ties."""
+        return values if self.ties is None else self.ties.spread(values, axis)
 
     def covariance(self, row):
         """Covariance (C, n, n) of one scene's spectra, with unknown sky levels if fitted."""
         n = int((self.scene == self.scenes[row]).sum())
-        if self.ties is not None:
-            given = self.ties, self.normal[row], self.right[row], self.fit_sky
-            return self.ties.spread(
-                spectrum_covariance(band_equations(*given)[0][:, :n, :n]), axis=0
-            )
-        own = np.r_[0:n, self.n_most : self.n_most + self.fit_sky]
-        return spectrum_covariance(self.normal[row][:, own[:, None], own])[:, :n, :n]
-
-
-def _by_band(looking):
-    """The least squares (k, C, n) of tied channels or, with the sky, (k, C, n + 1)."""
-    ties, n = looking.ties, looking.n_most
-    normal, right, own, value = band_equations(ties, looking.normal, looking.right, looking.fit_sky)
-    found = nnls_batch(normal.reshape(-1, n, n), right.reshape(-1, n))
-    spectra = ties.spread(found.reshape(right.shape), axis=1)
-    if not looking.fit_sky:
-        return spectra
-    sky = value - (own * spectra).sum(axis=-1)
-    return np.concatenate([spectra, sky[..., None]], axis=-1)
+        normal = self._band_equations(row)[0][:, :n, :n]
+        return self._spread(spectrum_covariance(normal), axis=0)

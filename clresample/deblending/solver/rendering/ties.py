@@ -75,12 +75,16 @@ class Ties:
 def band_equations(ties, normal, right, fit_sky):
     """Normal equations of spectra by band, the sky level of each channel eliminated.
 
+    ties: Ties of the C channels, None if each has its own band
+
     normal (..., C, n + 1, n + 1), right (..., C, n + 1): of n spectra and the level, the last
     fit_sky: whether levels are unknown; else they are 0
     returns normal (..., B, n, n), right (..., B, n), and the levels' own: their coupling to the
         spectra (..., C, n) and right sides (..., C), both divided by their curvature
     """
     gram, pull, own, value = without_level(normal, right, fit_sky)
+    if ties is None:
+        return gram, pull, own, value
     return ties.total(gram, axis=-3), ties.total(pull, axis=-2), own, value
 
 
@@ -94,5 +98,7 @@ def without_level(normal, right, fit_sky=True):
     free = (level > 0) & bool(fit_sky)
     over = np.divide(1, level, where=free, out=np.zeros_like(level))
     own, value = side * over[..., None], right[..., -1] * over
-    gram = normal[..., :-1, :-1] - own[..., None] * side[..., None, :]
+    gram = normal[..., :-1, :-1].copy()
+    for c in range(gram.shape[-3]):  # the products of all channels would be as large as `normal`
+        gram[..., c, :, :] -= own[..., c, :, None] * side[..., c, None, :]
     return gram, right[..., :-1] - side * value[..., None], own, value
