@@ -13,11 +13,8 @@ from ..resampling.resampler import Resampler
 from ..sky.frame import Frame
 from ..sky.mapping import Mapping
 from ..sky.varying_psf.basis import PSFBasis
-from .profiles import draw_psf
 from .solver.rendering.ties import Ties
 
-# [sigma] Stars whose PSF error is below this everywhere do not change the weights.
-MIN_PSF_ERROR_SIGMA = 0.05
 # Pixels of a model below this fraction of its brightest are set to 0 before rendering: their light
 # is negligible, but in float32 they would become denormals, which are 20 times slower.
 DENORMAL_FRACTION = 1e-20
@@ -79,17 +76,6 @@ class WhitenedView:
         return replace(
             self, sqrt_weights=self.sqrt_weights / np.sqrt(1 + (self.sqrt_weights * error) ** 2)
         )
-
-    def render(self, images, source) -> np.ndarray:
-        """Renders images (n, Ny, Nx) of the frame, padded or not, in all channels: (n, Co, My, Mx).
-
-        Each as the image of a source, by its number; in the op's type.
-        """
-        images = _padded(images, self.op.shape_in).astype(self.op.dtype)
-        if self.coefficients is None:
-            return self.op.render(images)
-        parts = self.coefficients[source].reshape(1, -1, 1, 1).astype(self.op.dtype)
-        return self.op.forward(images[:, None] * parts)
 
     def for_sources(self, chosen) -> WhitenedView:
         """The same view of a scene that has the sources `chosen` (k,) of this one alone."""
@@ -244,44 +230,6 @@ def whitened_view(home, observation, pad, device, dtype, *, private) -> Whitened
     op, shares = home.operator(observation, grid, device, dtype, private=private)
     data, weights = _padded(observation.data, shape), _padded(observation.weights, shape)
     return WhitenedView.of(op, home.frame, data, weights, shares)
-
-
-def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
-    """Views whose weights hold the error of the PSF in the light of bright stars.
-
-        1/w = sigma^2 + psf_error^2 sum_s [ L_s^2 + (r . grad L_s)^2 ],      L_s = A_s R S_s
-
-    where r is the distance from star s: L changes by -(2 L + r . grad L) epsilon if the PSF's width
-    grows by the fraction epsilon, so that its wings are more uncertain than its core.
-
-    stars: tuples of a Star, the number of its source, its place (2,) [model px] and its spectrum
-        (C,) [unit]
-    """
-    ends = np.cumsum([0, *(len(view.data) for view in views)])
-    squares = [0.0] * len(views)
-    for star, source, place, spectrum in stars if psf_error else ():
-        parts = [spectrum[a:b, None, None] for a, b in zip(ends, ends[1:], strict=False)]
-        pairs = list(zip(views, parts, strict=True))
-        # no pixel has more than all of its light
-        if all(
-            psf_error * np.abs(a * view.sqrt_weights).max() < MIN_PSF_ERROR_SIGMA
-            for view, a in pairs
-        ):
-            continue
-        images = draw_psf(star.psf, place, star.shape)
-        for i, (view, a) in enumerate(pairs):
-            seen = view.render(images, source)
-            light, *slopes = seen.astype(np.float64)  # slopes by the place: minus the gradient
-            n, m = np.indices(view.mapping.shape_out)
-            away = np.moveaxis(view.mapping.at(n, m) + view.op.shift - place, -1, 0)
-            change = sum(r * slope for r, slope in zip(away, slopes, strict=True))
-            found = (a * light) ** 2 + (a * change) ** 2
-            if psf_error * (np.sqrt(found) * view.sqrt_weights).max() > MIN_PSF_ERROR_SIGMA:
-                squares[i] = squares[i] + found
-    return [
-        view if np.isscalar(square) else view.with_model_error(psf_error * np.sqrt(square))
-        for view, square in zip(views, squares, strict=True)
-    ]
 
 
 def unfiltered_view(home, observation, view) -> WhitenedView:

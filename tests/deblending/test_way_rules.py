@@ -175,7 +175,7 @@ def test_signal_to_noise_is_zero_where_nothing_was_seen(device):
     looking = linearise([views], [star], PRECISION, 0.0, fit_sky=False)
     looking.render([0], [np.zeros(2)], np.ones(1), slopes=False)
     found = looking.signal_to_noise(np.zeros((1, 3)))
-    u = views[0].sqrt_weights * views[0].render(star.shape.draw(np.zeros(2), place)[:1], 0)[0]
+    u = views[0].sqrt_weights * views[0].op.render(star.shape.draw(np.zeros(2), place)[:1])[0]
     wanted = (u * views[0].sqrt_weights * views[0].data).sum() / np.linalg.norm(u)
     np.testing.assert_allclose(found, [[wanted, 0, 0]], rtol=1e-3)
 

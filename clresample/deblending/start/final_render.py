@@ -141,17 +141,12 @@ def _taken(looking):
     """Per scene and view, the ComponentImages of the present components."""
     found = [[] for _ in range(looking.n_scenes)]
     for sight in looking.sights:
-        seen, shape = looking.device.get(sight.seen), (sight.n_bands, sight.my, sight.mx)
-        images = [None] * len(looking.at)
-        for row in range(len(looking.at)):
-            _, _, _, wy, wx, _, begin = sight.place[row]
-            window = seen[begin : begin + sight.n_bands * wy * wx]
-            (y0, x0), (ny, nx) = sight.lit[row, :2] - sight.place[row, 1:3], sight.lit[row, 2:]
-            lit = window.reshape(sight.n_bands, wy, wx)[:, y0 : y0 + ny, x0 : x0 + nx]
-            images[row] = lit.astype(np.float64)
+        images = list(sight.lit_images())
         for b, ends in enumerate(found):
             own = np.flatnonzero(looking.slots.scene == b)
             own = own[np.argsort(looking.at[own])]
-            part = [images[k] for k in own]
-            ends.append(ComponentImages.cropped((len(own), *shape), sight.lit[own, :2], part))
+            low = [[side.start for side in images[k][0]] for k in own]
+            shape = len(own), sight.n_bands, sight.my, sight.mx
+            part = [np.ascontiguousarray(images[k][1][0]) for k in own]
+            ends.append(ComponentImages(shape, np.reshape(low, (-1, 2)), part))
     return found

@@ -106,13 +106,6 @@ class ProfileFit:
         self.population.own_light[scenes[some]] = OWN_LIGHT
         self._take(scenes[some & ~better])
 
-    def _look_again(self, scenes):
-        """Stores the equations of some scenes at parameters and spectra set from outside."""
-        if len(scenes):
-            self._look(scenes, self.theta, slopes=True)
-            self.looking.compute_residuals(MODEL_ERROR)
-            self._take_equations(scenes)
-
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
         kept = self.looking.kept_solution(), deepcopy(self.population)
@@ -300,4 +293,7 @@ def _run_without_doubt(fit, scenes):
         fit._take(scenes)
         worse = scenes[before[0][scenes] <= fit.chi2[scenes]]
         fit._restore(before, worse)
-        fit._look_again(worse)
+        if len(worse):
+            fit._look(worse, fit.theta, slopes=True)
+            fit.looking.compute_residuals(MODEL_ERROR)
+            fit._take_equations(worse)

@@ -24,10 +24,11 @@ from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
-from ..view import WhitenedView, allow_for_psf_error, pixel_noise
+from ..view import WhitenedView, pixel_noise
 from .component_batch import StartComponent, renumbered
 from .linearised_scenes import linearise
 from .profile_fit import ProfileFit, start_from
+from .star_weights import allow_for_psf_error
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -127,7 +128,7 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
     """Views with the PSF's error in bright stars in their weights; the start solved with these."""
-    views = allow_for_psf_error(patch.views, point.stars(), settings.psf_error)
+    views = allow_for_psf_error(patch.frame, patch.views, point.stars(), settings.psf_error)
     if all(new is old for new, old in zip(views, patch.views, strict=True)):
         return patch.views, point
     return views, _solved_again(replace(patch, views=views), point, settings.fit_sky)

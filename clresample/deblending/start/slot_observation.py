@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from ...resampling.plan import Precision
+from ...sky.box import box_slices, intersect_boxes
 from .component_batch import ComponentBatch, cumulative_offsets
 from .render_planner import RenderPlanner
 
@@ -85,6 +86,19 @@ class SlotObservation:
             at = int(slots.begin[run.first]), int(begin[run.first])
             n, shares = int(slots.n_images[run.first]), self.aim.shares(slots, run.first, run.last)
             run.renderer(images, at[0], self.seen, at[1], n, run.plan_index, run.offsets_px, shares)
+
+    def lit_images(self):
+        """Of each slot its lit window on the observation (slices y, x), and its images there.
+
+        Images (K, Co, ny, nx): float64
+        """
+        seen = self.device.get(self.seen)
+        for (_, y0, x0, wy, wx, k, begin), lit in zip(self.place, self.lit, strict=True):
+            images = seen[begin : begin + k * self.n_bands * wy * wx]
+            images = images.reshape(k, self.n_bands, wy, wx)
+            images = images[..., *box_slices(lit[:2] - (y0, x0), lit[2:])]
+            window, inside = intersect_boxes((0, 0), (self.my, self.mx), lit[:2], lit[2:])
+            yield window, images[..., *inside].astype(np.float64)
 
     def whiten(self):
         """Whitens the rendered images."""
