@@ -93,7 +93,7 @@ class Fit:
 
     @property
     def signature(self):
-        """Fits of equal signature start and iterate side by side; see Scene.batch_key."""
+        """Fits of equal signature start and iterate side by side, see `signature_of`."""
         ops = [view.op for view in self.views]
         known = signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
         return known, self.settings.fit_shifts

@@ -7,13 +7,13 @@ the method is tested too.
 import numpy as np
 import pytest
 from helpers.geometries import GEOMETRIES, ONE_OF_EACH, operator, psfs
+from helpers.scene_operators import MorphologyOperator, SpectraOperator
 from helpers.scenes import blend, fit
 from helpers.solver import BOXES, CLOSE, PRIOR, changed, engine, every_type, posed
 
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.buffers import SceneBuffers
 from clresample.deblending.solver.gradient import LossGradient
-from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
 from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.rendering.stages import BoxTransformRendering
 from clresample.deblending.solver.scene_model import compose

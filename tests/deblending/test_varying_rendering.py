@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from helpers.geometries import GEOMETRIES, ONE_OF_EACH
+from helpers.scene_operators import MorphologyOperator, SpectraOperator
 from helpers.solver import PRIOR, every_type, posed
 
 from clresample.deblending.solver.buffers import SceneBuffers
-from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
 from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.scene_model import compose
 from clresample.resampling import reference

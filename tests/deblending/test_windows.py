@@ -7,11 +7,11 @@ parts; their selection is tested too.
 import numpy as np
 import pytest
 from helpers.geometries import GEOMETRIES, affine, operator, psfs, turn
+from helpers.scene_operators import MorphologyOperator, SpectraOperator
 from helpers.solver import every_type, posed
 from test_rendering import KINDS, SCENES, buffers_of, operator_of, pairs_of
 
 from clresample.deblending.solver.gradient import LossGradient
-from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
 from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.rendering.windows import WindowGroups, WindowRendering
 from clresample.deblending.solver.scene_model import compose

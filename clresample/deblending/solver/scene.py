@@ -85,11 +85,6 @@ class Scene:
         pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.ops)
         return int(8 * (pixels + 12 * sum(m.size for m in self.profile)))
 
-    @property
-    def batch_key(self):
-        """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
-        return signature_of(self.shape, self.fit_sky, self.ops, self.ties)
-
 
 @dataclass(frozen=True, eq=False)
 class StructureState:
@@ -120,6 +115,9 @@ class State:
     learned: StructureState | None = None
 
 
-def signature_of(shape, fit_sky, ops, ties=None):
-    """`Scene.batch_key` of scenes with these."""
+def signature_of(shape, fit_sky, ops, ties):
+    """Signature of scenes: equal for those that can share a batch.
+
+    It holds frames, observed shapes and kernels to run.
+    """
     return shape, fit_sky, tuple(op.layout for op in ops), ties

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 
-from ...resampling.linop import LinOp
+from clresample.resampling.linop import LinOp
 
 
 class SceneOperator(LinOp):
