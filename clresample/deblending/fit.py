@@ -15,7 +15,7 @@ from .ended import Ended
 from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
 from .result import Component, Result
-from .solver.scene import signature_of
+from .solver.scene import image_numbers, signature_of
 from .start.final_render import MorphologyModel, RenderedModel, render_models
 from .start.first_scene import first_scene
 from .start.profile_start import (
@@ -233,8 +233,7 @@ def _scaled(state):
 
 def data_bytes(fit) -> int:
     """Device memory [bytes] that a fit's images take in a batch, roughly, whatever its sources."""
-    n = sum(2 * np.prod(v.op.shape_in) + 4 * np.prod(v.op.shape_out) for v in fit.views)
-    return int(8 * n)
+    return 8 * image_numbers([view.op for view in fit.views])
 
 
 def scene_bytes(fit) -> int:

@@ -74,16 +74,16 @@ def test_frames_are_padded_to_multiples():
 
 
 def test_memory_of_fits_and_scenes():
-    """Of 8 bytes a number: two images of the model and four of the observation for each band or
+    """Of 8 bytes a number: two images of the model and seven of the observation for each band or
     channel, twelve arrays a box of a scene."""
     shapes = [((1, 10, 12), (1, 5, 7)), ((3, 10, 12), (3, 5, 7))]
     ops = [SimpleNamespace(shape_in=inside, shape_out=out) for inside, out in shapes]
-    n_images = 8 * 4 * (2 * 120 + 4 * 35)
+    n_images = 8 * 4 * (2 * 120 + 7 * 35)
     assert data_bytes(SimpleNamespace(views=[SimpleNamespace(op=op) for op in ops])) == n_images
     one = SimpleNamespace(ops=ops, profile=[np.zeros((3, 3)), np.zeros((2, 5))])
     assert Scene.n_bytes.fget(one) == n_images + 8 * 12 * 19
     ops[0].shape_out = (2, 6, 7)
-    assert Scene.n_bytes.fget(one) == n_images + 8 * (12 * 19 + 4 * (2 * 42 - 35))
+    assert Scene.n_bytes.fget(one) == n_images + 8 * (12 * 19 + 7 * (2 * 42 - 35))
 
 
 def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None, n_scenes=50):

@@ -79,11 +79,9 @@ class Scene:
     def n_bytes(self) -> int:
         """Device memory [bytes] that the scene takes in a batch, roughly.
 
-        All numbers as float64, two model and four observed images per channel, twelve arrays for
-        each box.
+        All numbers as float64, `image_numbers` and twelve arrays for each box.
         """
-        pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.ops)
-        return int(8 * (pixels + 12 * sum(m.size for m in self.profile)))
+        return 8 * (image_numbers(self.ops) + 12 * sum(m.size for m in self.profile))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +111,15 @@ class State:
     spectra: np.ndarray
     sky: np.ndarray
     learned: StructureState | None = None
+
+
+def image_numbers(ops) -> int:
+    """Numbers of a scene's images on the device in a batch: 2 of the model, 7 of each channel.
+
+    Data, weights and their roots stay there as long as the fit; data and weights are copied for a
+    smaller batch; residuals and rendered images change.
+    """
+    return int(sum(2 * np.prod(op.shape_in) + 7 * np.prod(op.shape_out) for op in ops))
 
 
 def signature_of(shape, fit_sky, ops, ties):
