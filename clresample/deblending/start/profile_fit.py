@@ -101,10 +101,10 @@ class ProfileFit:
         self.population.own_light[scenes[some]] = OWN_LIGHT
         self._take(scenes[some])
         self._step(scenes[some], learn=True)
-        better = some & (_chi2_as_expected(self, scenes) < chi2)
-        self._restore(before, scenes[~better])
-        self.population.own_light[scenes[some]] = OWN_LIGHT
-        self._take(scenes[some & ~better])
+        worse = scenes[some & ~(_chi2_as_expected(self, scenes) < chi2)]
+        self._restore(before, worse)
+        self.population.own_light[worse] = OWN_LIGHT
+        self._take(worse)
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
