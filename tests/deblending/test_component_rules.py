@@ -104,7 +104,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         scene=SimpleNamespace(channels=lambda: parts),
         ties=None,
     )
-    seen = RenderedModel(None, None, covariance, tuple(observed), ())
+    seen = RenderedModel(None, None, covariance, tuple(observed), (), power, slope)
     asked = colour_gradient._asked(fit, np.array([1]), seen)
     core = np.einsum("cj,jc->c", covariance[:, 2], slope)
     precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)
@@ -187,7 +187,7 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
     morphs, profile = ([rng.random((3 + i, 4)) for i in range(3)] for _ in range(2))
     fit = SimpleNamespace(
         scene=SimpleNamespace(profile=profile, origin=np.array([[1, 2], [3, 4], [5, 6]])),
-        state=SimpleNamespace(morph=morphs),
+        state=SimpleNamespace(morph=morphs, spectra=rng.random((3, 2)), sky=rng.random(2)),
         start=SimpleNamespace(source=np.array([0, 0, 1])),
         padded=SimpleNamespace(shape=(40, 41)),
         views=["a", "b"],
@@ -203,4 +203,6 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
     assert model.morphs[:3] == morphs and len(model.morphs) == 5
     np.testing.assert_array_equal(model.morphs[3], morphs[2] * profile[2])
     np.testing.assert_array_equal(model.morphs[4], morphs[0] * profile[0])
-    assert len(colour_gradient.model_of(fit).morphs) == 3
+    np.testing.assert_array_equal(model.spectra[:3], fit.state.spectra)
+    assert model.spectra.shape == (5, 2) and not model.spectra[3:].any()
+    assert model.sky is fit.state.sky and len(colour_gradient.model_of(fit).morphs) == 3

@@ -55,7 +55,9 @@ def test_models_are_seen_side_by_side_each_with_its_own_spectra(
     for of, part, other in zip(own, (BOXES[:2], BOXES[2:]), ([None, bare], [None, None])):
         low = np.array([origin for origin, _ in part])
         shown = images[: len(part)] if len(part) == 2 else images[2:]
-        models.append(MorphologyModel(SHAPE, of, other, np.zeros(len(part), int), low, shown))
+        known = 100 + 10 * np.arange(3 * len(part)).reshape(-1, 3), np.array([0.2, -0.1, 0.3])
+        source = np.zeros(len(part), int)
+        models.append(MorphologyModel(SHAPE, of, other, source, low, shown, *known))
     found = render_models(models, fit_sky=fit_sky)
     for model, seen in zip(models, found, strict=True):
         pairs = zip(model.origin, model.morphs, strict=True)
@@ -66,6 +68,16 @@ def test_models_are_seen_side_by_side_each_with_its_own_spectra(
         np.testing.assert_allclose(seen.sky, level, atol=10 * close)
         scale = np.abs(covariance).max()
         np.testing.assert_allclose(seen.covariance, covariance, atol=10 * close * scale)
+        parts, left, power = (slice(0, 1), slice(1, 3)), [], []
+        for unit, v, own_channels in zip(units, model.views, parts, strict=True):
+            root, data = (x.reshape(len(v.data), -1) for x in (v.sqrt_weights, v.data))
+            rest = root * (data - model.sky[own_channels, None])
+            rest -= np.einsum("ic,icp->cp", model.spectra[:, own_channels], unit)
+            left.append(np.einsum("icp,cp->ic", unit, rest))
+            power.append(np.square(unit).sum(2))
+        left, power = np.concatenate(left, 1), np.concatenate(power, 1)
+        np.testing.assert_allclose(seen.slope, left, atol=10 * close * np.abs(left).max())
+        np.testing.assert_allclose(seen.power, power, rtol=10 * close)
         for v, other, shown, taken in zip(
             model.views, model.unfiltered_views, seen.observed, seen.unfiltered_views, strict=True
         ):

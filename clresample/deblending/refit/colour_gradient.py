@@ -98,24 +98,21 @@ def model_of(fit, which=()):
     cores = [morphs[i] * scene.profile[i] for i in which]
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
-    return MorphologyModel(fit.padded.shape, fit.views, bare, source, origin, morphs + cores)
+    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
+    given = source, origin, morphs + cores, spectra, fit.state.sky
+    return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 
 
 def _asked(fit, which, seen):
     """Tests the rendered images of `model_of` for second components."""
     spectra, sky, n = fit.state.spectra, fit.state.sky, len(fit.state.morph)
-    slope, power = np.zeros((2, n + len(which), len(sky)))  # of images with residual, and itself
+    slope, power = seen.slope, seen.power
     bare, residuals, channels = [], [], fit.scene.channels()
     for view, rendered, part in zip(fit.views, seen.observed, channels, strict=True):
         bare.append(
             ComponentImages((n, *rendered.shape[1:]), rendered.low[:n], rendered.images[:n])
         )
         residuals.append(view.data - bare[-1].total(spectra[:, part]) - sky[part, None, None])
-        for i, image in enumerate(rendered.images):
-            window = (slice(None), *rendered.window(i))
-            weighted = image * view.sqrt_weights[window] ** 2
-            slope[i, part] = (weighted * residuals[-1][window]).sum(axis=(1, 2))
-            power[i, part] = (weighted * image).sum(axis=(1, 2))
     chi2 = local_chi2(bare, fit.views, channels, spectra, residuals)[which]
     covariance, cores = seen.covariance, power[n:]
     if fit.ties is not None:

@@ -29,6 +29,7 @@ class MorphologyModel:
         has none
     source (n,): number of each one's source, which selects its PSF in the views
     origin (n, 2) [px], morphs (n): arrays (ny, nx), in boxes of the frame
+    spectra (n, C), sky (C,): those about which slopes are asked for, None for none
     """
 
     frame: tuple[int, int]
@@ -37,6 +38,8 @@ class MorphologyModel:
     source: np.ndarray
     origin: np.ndarray
     morphs: list
+    spectra: np.ndarray | None = None
+    sky: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,8 @@ class RenderedModel:
         units
     observed: per view, ComponentImages (n, Co, My, Mx); unfiltered_views: likewise, None where it
         is the same
+    power, slope (n, C): products of the whitened images with themselves, and with what the model's
+        own spectra and sky leave of the data; None without these
     """
 
     spectra: np.ndarray
@@ -54,6 +59,8 @@ class RenderedModel:
     covariance: np.ndarray
     observed: tuple[ComponentImages, ...]
     unfiltered_views: tuple
+    power: np.ndarray | None = None
+    slope: np.ndarray | None = None
 
     def residuals(self, channels, views):
         """Data minus model (Co, My, Mx) of each of the WhitenedViews, in their units.
@@ -127,6 +134,7 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
                 looking.covariance(b),
                 tuple(observed[b]),
                 tuple(bare[b]),
+                *_products(looking, b, models[b]),
             )
         )
     return found
@@ -135,6 +143,16 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
 def _looking(views, components, fit_sky):
     precision = Precision.of(views[0][0].op.dtype)
     return linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+
+
+def _products(looking, b, model):
+    """See RenderedModel.power, slope."""
+    if model.spectra is None:
+        return None, None
+    n, normal, known = len(model.morphs), looking.normal[b], np.zeros_like(looking.right[b])
+    known[:, :n], known[:, -1] = model.spectra.T, model.sky
+    left = looking.right[b] - np.einsum("cij,cj->ci", normal, known)
+    return np.einsum("cii->ic", normal)[:n].copy(), left[:, :n].T
 
 
 def _taken(looking):
