@@ -64,26 +64,20 @@ def find_exchange_directions(scene, state, evidence, strengths):
 
 def _direction(scene, state, boxes, pair, evidence, strengths):
     """The ExchangeDirection of a pair (i, j) of sources, None if it is steep."""
-    (i, j), theirs = pair, state.morph[pair[1]].astype(np.float32)
-    shared = boxes[j].intersection(boxes[i])
-    here = shared.relative_to(boxes[j]).slices
-    lit = state.morph[i][shared.relative_to(boxes[i]).slices] > 0
-    if np.square(theirs[here])[lit].sum() < MIN_SHARED * np.square(theirs).sum():
-        return None
-    evidence, alpha, spectrum = evidence[i], strengths[i], state.spectra[i]
-    prior, profile = evidence.prior, scene.profile[i].astype(np.float32)
+    (i, j), (evidence, alpha) = pair, (evidence[pair[0]], strengths[pair[0]])
+    prior, profile, spectrum = evidence.prior, scene.profile[i].astype(np.float32), state.spectra[i]
     box = boxes[j].grown(max(prior.radii)).intersection(boxes[i])
     window = box.relative_to(boxes[i]).slices
-    p, own = profile[window], state.morph[i][window]
-    light = np.zeros_like(p)
-    light[shared.relative_to(box).slices] = theirs[here]
+    p, own, theirs = profile[window], state.morph[i][window], state.morph[j].astype(np.float32)
+    light, shared = np.zeros_like(p), box.intersection(boxes[j])
+    light[shared.relative_to(box).slices] = theirs[shared.relative_to(boxes[j]).slices]
     wanted = np.where(own > 0, light, 0)
     power = np.square(spectrum)
     alone = (power * scene.spectrum_curvature[j]).sum()
     # the prior's term is at least that of light as wide as the widest kernel
     widest = (np.square(alpha * prior.scales_px) * 4 * np.pi).sum()
     least = np.divide(wanted**2, p, where=p > 0, out=np.zeros_like(p)).sum() / widest
-    if least > MAX_CURVATURE * alone:
+    if (wanted**2).sum() < MIN_SHARED * (theirs**2).sum() or least > MAX_CURVATURE * alone:
         return None
     z, u = coefficients_of(prior, profile, wanted, alpha, window)
     part = (p * u).sum() / (profile * profile).sum()
