@@ -165,16 +165,18 @@ class LbfgsRun:
         Converged fits then continue.
         """
         engine, p = self.engine, self.engine.progress
-        enough = MIN_JOINT_GAIN * self.settings.loss_tol * p.chi2()
         rounds, loss, promised, made = self.asked.T
-        there = np.array([j is not None for j in self.joint_steps])
         due = p.n_rounds >= np.maximum(rounds + JOINT_STEP_ITERATIONS, FIRST_JOINT_STEP)
+        which = which & (p.converged | (p.live & p.settled & p.tested & due))
+        if not which.any():
+            return
+        enough = MIN_JOINT_GAIN * self.settings.loss_tol * p.chi2()
+        there = np.array([j is not None for j in self.joint_steps])
         with np.errstate(invalid="ignore"):  # fits whose loss was never finite
             fallen = loss - p.loss
         failed = there & (fallen < MIN_JOINT_PROGRESS * promised)
         old = failed & (made < MAX_JOINT_MATRICES)
-        ready = p.converged | (p.live & p.settled & p.tested & due)
-        which = which & ready & ((fallen > enough) | old)
+        which &= (fallen > enough) | old
         if not which.any() or self.n_steps + CONVERGENCE_WINDOW >= self.settings.max_iter:
             return  # a fit needs this many iterations to converge again
         new = which & ((made == 0) | old)

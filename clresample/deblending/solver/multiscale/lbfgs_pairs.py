@@ -71,22 +71,18 @@ class LbfgsPairs:
         b = np.arange(len(sg))[:, None]
         order = self._order[:, 1:]
         valid = self._valid[b, order]
-        sy = self._sy[b[:, :, None], order[:, :, None], order[:, None]]
-        yy = self._yy[b[:, :, None], order[:, :, None], order[:, None]]
-        sy, yy = (np.where(valid[:, :, None] & valid[:, None], m, 0) for m in (sy, yy))
-        own = np.einsum("bkk->bk", sy)
-        rho = np.divide(1, own, where=own > 0, out=np.zeros_like(own))
+        at = b[:, :, None], order[:, :, None], order[:, None]
+        both = valid[:, :, None] & valid[:, None]
+        sy, yy = (np.where(both, products[at], 0) for products in (self._sy, self._yy))
         sg, yg = (np.where(valid, v[b, order], 0) for v in (sg, yg))
-        newest = np.argmax(valid, axis=1)
+        own, newest = np.diagonal(sy, axis1=1, axis2=2), np.argmax(valid, axis=1)
         top = own[b[:, 0], newest], yy[b[:, 0], newest, newest]
         scale = np.divide(*top, where=top[1] > 0, out=np.ones(len(sg)))
-        a, c = np.zeros_like(sg), np.zeros_like(sg)
-        for i in range(a.shape[1]):
-            a[:, i] = rho[:, i] * (sg[:, i] - np.einsum("bj,bj->b", sy[:, i, :i], a[:, :i]))
-        yr = scale[:, None] * (yg - np.einsum("bij,bj->bi", yy, a))
-        for i in reversed(range(a.shape[1])):
-            past = np.einsum("bj,bj->b", sy[:, i + 1 :, i], c[:, i + 1 :])
-            c[:, i] = a[:, i] - rho[:, i] * (yr[:, i] + past)
+        # both loops of the recursion are triangular systems
+        lower = np.tril(sy) + (~valid)[:, :, None] * np.eye(valid.shape[1])
+        a = np.linalg.solve(lower, sg[:, :, None])
+        right = own[:, :, None] * a - scale[:, None, None] * (yg[:, :, None] - yy @ a)
+        a, c = a[:, :, 0], np.linalg.solve(lower.swapaxes(1, 2), right)[:, :, 0]
         out = np.zeros((2, *self._valid.shape))
-        out[0][b, order], out[1][b, order] = a, np.where(valid, c, 0)
+        out[0][b, order], out[1][b, order] = a, c
         return out[0], out[1], scale

@@ -18,7 +18,8 @@ from .prior import kernel_rows
 
 # Conjugate gradients for a wanted u, and the variance [1] that is added to the prior's of
 # u / sqrt(p): with 30 and 1e-5 the data's curvature along the direction is a tenth of the prior's
-# for a giant of signal to noise 7000 (bench.ladder), and five times it with 10 and 1e-4.
+# for a giant of signal to noise 7000 (bench.ladder), and five times it with 10 and 1e-4. With 12
+# steps for exchange directions HST with HSC takes 928 iterations in place of 98 (bench.real).
 N_STEPS, VARIANCE = 30, 1e-5
 
 
