@@ -22,7 +22,13 @@ from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
-from .shared_light import exchanged_light, flux_changes, shape_doubts, with_shared_light
+from .shared_light import (
+    doubted_shapes,
+    exchanged_light,
+    flux_changes,
+    flux_doubts,
+    with_shared_light,
+)
 
 # Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
 MIN_ERROR = 1e-9
@@ -211,8 +217,9 @@ def with_errors(fit, result, peaks, seen):
     cores = core_errors(result, fit.settings.psf_error)
     shapes = np.hypot(_beyond_curvature(fit, result, errors), missed_light(result))
     errors = with_core_errors(widened(with_common_error(errors, shapes), outside), cores)
-    doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
-    exchanged = exchanged_light(result, start.source, fit.scene)
+    doubted = doubted_shapes(posterior)
+    doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
+    exchanged = exchanged_light(result, posterior.solution, doubted)
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
