@@ -215,8 +215,8 @@ def with_errors(fit, result, peaks, seen):
     )
     fit.note_seconds("errors", time.perf_counter() - began)
     cores = core_errors(result, fit.settings.psf_error)
-    # By the larger of curvature and scatter 60 % of fluxes at signal to noise 10 to 20 would be
-    # within their errors, by both together 68 % (bench.ladder, single).
+    # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
+    # within their errors, by both together 70 % (bench.ladder, single).
     shapes = missed_light(result)
     shapes[fit.fitted] = np.hypot(shapes[fit.fitted], start.flux_scatter * fit.unit)
     errors = with_core_errors(widened(with_common_error(errors, shapes), outside), cores)
