@@ -3,17 +3,21 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from helpers.blends import gaussian
 from helpers.scenes import blend, fit
 
-from clresample.deblending.posterior import posterior, shared_light
+from clresample import PSF
+from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.errors import Errors
 from clresample.deblending.posterior.shared_light import (
     MAX_DOUBT,
+    DoubtedShape,
     exchanged_light,
     flux_changes,
     with_shared_light,
 )
+from clresample.deblending.profiles import SIZE_SCATTER, GalaxyProfile
 from clresample.deblending.result import Component
 
 
@@ -23,8 +27,10 @@ def test_a_doubted_shape_has_less_of_the_datas_precision():
     known = np.linalg.inv(np.eye(4) + half @ half.T)
     for factor in (1.0, 5.0, 1e12):
         wanted = np.linalg.inv(np.eye(4) + half @ half.T / factor)
-        root = known @ shared_light._added_root(known, factor)
+        shape = DoubtedShape.of(known, factor, np.arange(4))
+        root = known @ shape.added_root
         np.testing.assert_allclose(known + root @ root.T, wanted, atol=1e-7)
+        assert shape.size_scatter == pytest.approx(SIZE_SCATTER * np.sqrt(wanted[0, 0]))
 
 
 def test_structure_at_another_place_is_counted_there():
@@ -40,12 +46,52 @@ def test_structure_at_another_place_is_counted_there():
     result = SimpleNamespace(components=components, sources=(0, 1), channels="gr")
     origin = np.array([(0, 0), (3, 5)])
     given = {"profile": [wide, small], "origin": origin, "fixed": np.array([False, False])}
-    found = exchanged_light(result, np.arange(2), SimpleNamespace(**given))
+
+    def exchanged(source):
+        scene = SimpleNamespace(**given)
+        return exchanged_light(result, SimpleNamespace(scene=scene, source=source), {})
+
+    found = exchanged(np.arange(2))
     np.testing.assert_allclose(found[1, 0], 0.1 * small.sum() * spectra[1], rtol=0.02)
     assert not found[0, 1].any() and not found[[0, 1], [0, 1]].any()
     given["fixed"] = np.array([True, False])  # a star has no structure
-    assert not exchanged_light(result, np.arange(2), SimpleNamespace(**given)).any()
-    assert not exchanged_light(result, np.zeros(2, int), SimpleNamespace(**given)).any()
+    assert not exchanged(np.arange(2)).any()
+    assert not exchanged(np.zeros(2, int)).any()
+
+
+def test_a_doubted_profile_is_compared_with_the_ring_around_it():
+    """A galaxy fitted too small has its core, and structure of its neighbour holds the rest."""
+    frame = SimpleNamespace(
+        grid=SimpleNamespace(pixel_scale_arcsec=0.25), shape=(201, 201), psf=PSF.gaussian(1.0)
+    )
+    shape, place = GalaxyProfile(frame), np.array([100.0, 100.0])
+    thetas = [np.array([size, 0, 0, 1.5]) for size in (0.3, 0.3 + SIZE_SCATTER, 3.5)]
+    small, larger, wide = (shape.draw(theta, place)[0] for theta in thetas)
+    box = np.s_[92:109, 92:109]
+    core = (small * larger)[box].sum() / np.square(small[box]).sum()
+    bumped, peak = wide.copy(), small.max()
+    bumped[box] += 0.1 * (larger - core * small)[box]
+    spectra = np.array([[2.0, 3.0], [50.0, 70.0]])
+    parts = ((0, 0), bumped, spectra[1]), ((92, 92), small[box] / peak, spectra[0])
+    components = tuple(Component(i, *part) for i, part in enumerate(parts))
+    result = SimpleNamespace(components=components, sources=(0, 1), channels="gr")
+    scene = SimpleNamespace(
+        profile=[wide, small[box] / peak],
+        origin=np.array([(0, 0), (92, 92)]),
+        fixed=np.zeros(2, bool),
+    )
+    solution = SimpleNamespace(
+        scene=scene,
+        source=np.arange(2),
+        thetas=thetas[::-2],
+        shapes=[shape] * 2,
+        positions=[place] * 2,
+    )
+    doubted = DoubtedShape.of(np.eye(4), 1e6, np.arange(4))
+    same, found = (exchanged_light(result, solution, d)[1, 0, 0] for d in ({}, {1: doubted}))
+    # the wide profile itself takes a little of the ring
+    ring = 1 - core * (small * larger)[box].sum() / np.square(larger[box]).sum()
+    np.testing.assert_allclose([same, found], [0, 5 * ring * larger[box].sum()], atol=0.05)
 
 
 def test_exchanged_light_leaves_the_sum_of_two_fluxes_alone():

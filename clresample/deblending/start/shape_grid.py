@@ -39,8 +39,9 @@ UNUSUAL, SIZE_RANGE, WINGS_RANGE = 0.3, 4.0, 3.0
 # Posterior fraction of unusual galaxies from which an estimate moves. If all move, median SDRs of
 # simulated COSMOS galaxies are 0.3 dB lower in Euclid's images (32 scenes, seed 3000).
 MIN_UNUSUAL = 0.5
-# Steps from the fitted ln sigma, and the values of ln beta at each of them.
-SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.9, -0.1, -1.1, -2.1])
+# Steps from the fitted ln sigma, and the values of ln beta at each of them. With -2.1 as the least,
+# galaxies of n = 4 at signal to noise 10 to 20 are fainter by 0.2 of their errors (bench.ladder).
+SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.4, -1.1, -2.6])
 # Further steps for galaxies without significant light, and their ln beta: light of galaxies of r_e
 # over 25 px at signal to noise 10 to 15 is not significant in a small profile (bench.ladder).
 FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
