@@ -65,7 +65,7 @@ def nnls_batch(normal, right):
     until both have the right signs, for all problems side by side. With many sources at one
     position this may cycle, in particular if rounding leaves N with negative eigenvalues.
     """
-    out = np.empty_like(right)
+    out = np.empty(right.shape)
     for at in portions(len(normal), 8 * normal.shape[-1] ** 2):
         out[at] = _nnls(normal[at], right[at])
     return out
@@ -114,7 +114,7 @@ def spectrum_covariance(normal):
     its inverse with negative or too small variances, below those with all other unknowns fixed. In
     that case eigenvalues are set to RIDGE at least.
     """
-    out = np.empty_like(normal)
+    out = np.empty(normal.shape)
     for at in portions(len(normal), 8 * normal.shape[-1] ** 2):
         out[at] = _inverses(normal[at])
     return out

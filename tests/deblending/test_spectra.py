@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from clresample.deblending.spectra import RIDGE, nnls_batch, spectrum_covariance, unit_diagonal
+from clresample.deblending import spectra
+from clresample.deblending.spectra import (
+    RIDGE,
+    nnls_batch,
+    portions,
+    solve_in_place,
+    spectrum_covariance,
+    unit_diagonal,
+)
 
 
 def test_sources_in_one_place_have_variances_though_rounding_made_the_matrix_indefinite():
@@ -108,3 +116,26 @@ def test_matrices_that_rounding_spoiled_harm_no_others():
         np.testing.assert_allclose(one, spectrum_covariance(own[None])[0], rtol=1e-6)
     variance = np.diagonal(found, axis1=1, axis2=2) * np.diagonal(normal, axis1=1, axis2=2)
     assert (variance > 0.99).all()
+
+
+def test_portions_change_no_result(monkeypatch):
+    rng = np.random.default_rng(9)
+    images = rng.normal(size=(7, 4, 20))
+    normal, right = images @ images.swapaxes(1, 2), rng.normal(size=(7, 4))
+    whole = nnls_batch(normal, right), spectrum_covariance(normal)
+    monkeypatch.setattr(spectra, "PORTION_BYTES", 3 * normal[0].nbytes)
+    assert portions(7, normal[0].nbytes) == [slice(0, 3), slice(3, 6), slice(6, 7)]
+    assert portions(2, 4 * normal[0].nbytes) == [slice(0, 1), slice(1, 2)] and portions(0, 8) == []
+    for found, wanted in zip((nnls_batch(normal, right), spectrum_covariance(normal)), whole):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_matrices_are_solved_in_their_own_memory():
+    rng = np.random.default_rng(10)
+    matrix, right = rng.normal(size=(5, 5)), rng.normal(size=5)
+    matrix += matrix.T
+    before = matrix.copy()
+    np.testing.assert_allclose(before @ solve_in_place(matrix, right), right, atol=1e-12)
+    assert (matrix != before).any()
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_in_place(np.zeros((2, 2)), np.ones(2))

@@ -121,7 +121,8 @@ def _eliminate(normal, right, inner, cross, rest, lit):
     of the spectra, of which those `lit` (k, C, m) are free; cross (k, C, m, n, p): of both
     """
     k, n_channels, m, n, p = cross.shape
-    cross, rest = cross.reshape(k, n_channels, m, n * p) * lit[..., None], rest * lit
+    cross, rest = cross.reshape(k, n_channels, m, n * p), rest * lit
+    cross *= lit[..., None]
     inner = inner * lit[..., None] * lit[..., None, :]
     add_diagonal(inner, RIDGE * np.trace(inner, axis1=2, axis2=3)[..., None] + ~lit)
     solved = np.linalg.solve(inner, cross)

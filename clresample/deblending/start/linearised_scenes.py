@@ -132,8 +132,8 @@ class LinearisedScenes:
         for sight, pairs in zip(self.sights, self.overlapping_pairs, strict=True):
             products = ImageProducts(self, sight, *pairs)
             for part, channels in products.portions(8 * k * m**2):
-                found = products.with_spectra(part, [x[:, channels] for x in levels])
-                self.normal[:, channels], _, self.right[:, channels] = found
+                at, own = (slice(None), channels), [x[:, channels] for x in levels]
+                self.normal[at], _, self.right[at] = products.with_spectra(part, own)
         self.right += np.einsum("kcij,kcj->kci", self.normal, self.solution())
         normal, right, own, value = self._band_equations()
         n = self.n_most

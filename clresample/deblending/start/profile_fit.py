@@ -56,7 +56,7 @@ class ProfileFit:
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
-        self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
+        self.normal = [np.zeros(0)] * size[0]
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -222,9 +222,11 @@ class ProfileFit:
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some of the scenes rendered last."""
+        for b in scenes:
+            self.normal[b] = np.zeros(0)  # before there are others
         normal, right = normal_equations(self.looking)
-        rows = self.looking.rows_of(scenes)
-        self.normal[scenes], self.right[scenes] = normal[rows], right[rows]
+        for b, row in zip(scenes, self.looking.rows_of(scenes), strict=True):
+            self.normal[b], self.right[b] = normal[row].copy(), right[row]
 
     def _equations(self, scenes):
         """Equations of some scenes, as `StepControl.next` takes them."""
@@ -236,8 +238,10 @@ class ProfileFit:
     def own_equations(self, scenes):
         """Normal matrices (k, n, 4, 4) of each component of some scenes alone, prior included."""
         n, p = self.theta.shape[1:]
-        own = np.einsum("biqir->biqr", self.normal.reshape(-1, n, p, n, p))[scenes]
-        return add_diagonal(own, self.population.precision(scenes, self.theta))
+        own = [np.einsum("iqir->iqr", self.normal[b].reshape(n, p, n, p)) for b in scenes]
+        return add_diagonal(
+            np.reshape(own, (-1, n, p, p)), self.population.precision(scenes, self.theta)
+        )
 
     def _measure_brightness(self, theta):
         """Stores the components' peaks over a model pixel's noise, in their best channel."""
