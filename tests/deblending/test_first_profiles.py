@@ -109,7 +109,7 @@ def test_a_fit_that_found_the_large_galaxy_goes_on(sized, monkeypatch):
         trials.clear()
         sized([GIANT, ((20.0, 24.0), (900, 800, 700), 2.0)], instead)
         counts.append(len(trials))
-    assert counts[2] <= counts[1] + 1 < counts[0] + 3
+    assert counts[2] <= counts[1] < counts[0] + 3
 
 
 def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
@@ -155,7 +155,7 @@ def test_large_galaxies_of_an_earlier_fit_are_no_reason_for_a_second_start(sized
     real, trials = profile_fit.ProfileFit._step, []
 
     def step(fit, scenes, *given, **options):
-        fit.is_known[:] = known
+        fit.is_known[:] = is_known[0]
         if options.get("learn"):
             trials.append(fit.theta[0, :, 0].copy())
         real(fit, scenes, *given, **options)
@@ -163,7 +163,8 @@ def test_large_galaxies_of_an_earlier_fit_are_no_reason_for_a_second_start(sized
     monkeypatch.setattr(profile_fit.ProfileFit, "_step", step)
     small = (84.0, 12.0), (9000, 8000, 7000), 1.5
     objects, numbers = [GIANT, ((24.0, 70.0), (4e4, 3e4, 3e4), 9.0), small], []
-    for known, large in ((False, [0]), (True, [0]), (True, [2])):
+    is_known = [False]
+    for is_known[0], large in ((False, [0]), (True, [0]), (True, [2])):
         trials.clear()
 
         def instead(fit, scenes, _error, large=large):

@@ -126,6 +126,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
             status=Ended.CONVERGED,
             sources=(known,),
             thetas=(("its profile",),),
+            structures=(("its structure",),),
         )
         for x in (4900.0, 5100.0)
     )
@@ -152,6 +153,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     assert [b.sources[1].position_px for b in blends] == [(5.0, 7.0)] * fitted
     assert [[s.name for s in b.sources] for b in blends] == [["76", "77"]] * fitted
     assert [b.thetas for b in blends] == [(("its profile",), ())] * fitted
+    assert [b.structures for b in blends] == [(("its structure",), ())] * fitted
 
 
 def test_what_was_found_is_carried_from_round_to_round(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from ...device.tuning import Tuning
@@ -81,7 +79,6 @@ class LinearisedScenes:
         if whiten:
             self.whiten()
 
-    @cached_property
     def n_pixels(self) -> np.ndarray:
         """Numbers (B,) of pixels with weight, all channels together."""
         weights = [[view.sqrt_weights for view in sight.views] for sight in self.sights]

@@ -17,12 +17,7 @@ from .step_control import StepControl
 
 # Largest number of steps, and the gain in chi2 below which they end, measured or expected.
 N_STEPS, CHI2_TOL = 40, 1.0
-# The same gain as a part of the chi2 that the profiles leave above the noise, if that is larger:
-# structure then takes over. Starts of giants' blends end a fifth earlier with the same chi2 within
-# 1e-3 (`simulate field --sky bright`, seed 1).
-MISFIT_TOL = 1e-3
-# Largest number of steps after each large profile that is added, before all are fitted together,
-# and smallest number before a first start pauses.
+# Largest number of steps after each large profile that is added, before all are fitted together.
 N_FIRST_STEPS = 5
 # A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
 # per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
@@ -33,10 +28,6 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # the grid of sizes. Of 30 scenes with large galaxies (bench.ladder, seed 77) second starts gained
 # 6 in chi2 at most where the large galaxies were those that had grown, but for one.
 MIN_GROWTH = 0.5 * np.log(GROWTH)
-# A first start pauses for a second one after N_FIRST_STEPS if a galaxy is then larger than expected
-# by this in ln sigma, and goes on if it is the better one. A third of the start of a field of large
-# galaxies were steps that a second start replaced (`simulate field --sky bright`, seed 1).
-PAUSE_GROWTH = np.log(GROWTH)
 
 
 class ProfileFit:
@@ -48,10 +39,8 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
-    brightness (N,): of the components, see `thresholds`
+    brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
-    is_known, is_paused (B,): scenes that start from an earlier fit, and those whose first start
-        waits for a second one
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -68,7 +57,7 @@ class ProfileFit:
         self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
-        self.is_known, self.is_paused = np.zeros((2, size[0]), bool)
+        self.is_known = np.zeros(size[0], bool)
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -86,13 +75,38 @@ class ProfileFit:
         Then sets size and wings of faint galaxies from grids.
         """
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        self._step(np.flatnonzero(some), learn=True, pause=True)
+        self._step(np.flatnonzero(some), learn=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
-            _run_from_large_galaxies(self, scenes)
+            self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
         fit_faint_shapes(self, np.flatnonzero(some))
+
+    def _run_from_large_galaxies(self, scenes):
+        """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
+
+        Scenes in which no larger profile has more of the light keep the first fit; where the large
+        galaxies are those that grew in it, or some of an earlier fit's, it goes on with less doubt.
+        """
+        before, chi2 = self._copy(), _chi2_as_expected(self, scenes)
+        grown = _growth(self)[scenes] > MIN_GROWTH
+        self.theta[scenes] = self.expected.mean[scenes]
+        self.population.reset(scenes, self.expected)
+        self.population.own_light[scenes] = OWN_LIGHT
+        self._look(scenes, self.theta, slopes=False)
+        self.looking.solve(MODEL_ERROR)
+        large = first_profiles(self, scenes, MODEL_ERROR)[scenes]
+        some, same = large.any(axis=1), (large == grown).all(axis=1)
+        same |= self.is_known[scenes] & (large <= grown).all(axis=1)
+        self._restore(before, scenes[same | ~some])
+        self.population.own_light[scenes[some]] = OWN_LIGHT
+        self._take(scenes[some])
+        self._step(scenes[some], learn=True)
+        better = some & (_chi2_as_expected(self, scenes) < chi2)
+        self._restore(before, scenes[~better])
+        self.population.own_light[scenes[some]] = OWN_LIGHT
+        self._take(scenes[some & ~better])
 
     def _look_again(self, scenes):
         """Stores the equations of some scenes at parameters and spectra set from outside."""
@@ -142,10 +156,8 @@ class ProfileFit:
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
-    def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False, pause=False):
+    def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
         """Step until some scenes have ended; free (B, n): the components that move.
-
-        pause: scenes with large galaxies end early, see PAUSE_GROWTH.
 
         learn: update the prior after each step, of each scene until that takes back what the step
         gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
@@ -156,22 +168,17 @@ class ProfileFit:
         live = np.isin(np.arange(len(self.theta)), scenes)
         free = np.ones(self.source.shape, bool) if free is None else free
         for i_step in range(n_steps):
-            if pause and i_step >= N_FIRST_STEPS:
-                self.is_paused |= live & (_growth(self).max(axis=1) > PAUSE_GROWTH)
-                live &= ~self.is_paused
             scenes = np.flatnonzero(live)
             given = *self._equations(scenes), self.population.galaxies[scenes], free[scenes]
             trial, expected, promised = steps.next(scenes, *given)
-            enough = self._tolerance(scenes)
-            on = expected >= enough
+            on = expected >= CHI2_TOL
             live[scenes[~on]] = False
             scenes = scenes[on]
             if not len(scenes):
                 break
             gain = self._try(scenes, trial[on])
             gained = gain > 0
-            small = gained & (gain < enough[on])
-            live[scenes] = steps.take(scenes, gain, promised[on]) & ~small
+            live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & (gain < CHI2_TOL))
             if gained.any():
                 self._take_equations(scenes[gained])
             further = scenes[gained & live[scenes]]
@@ -180,10 +187,6 @@ class ProfileFit:
                 learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
         if learn:
             self._take(np.flatnonzero(~learning))
-
-    def _tolerance(self, scenes):
-        """Gains (k,) of chi2 below which steps end."""
-        return np.maximum(CHI2_TOL, MISFIT_TOL * (self.chi2 - self.looking.n_pixels)[scenes])
 
     def _try(self, scenes, trial):
         """Tries parameters (k, n, 4) of each of the scenes; the gains (k,).
@@ -268,7 +271,7 @@ def _growth(fit):
 
 def _may_hold_large_galaxies(fit):
     """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained."""
-    unexplained = fit.chi2 > MAX_CHI2 * fit.looking.n_pixels
+    unexplained = fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()
     return (_growth(fit).max(axis=1) > MAX_GROWTH) | unexplained
 
 
@@ -276,34 +279,6 @@ def _chi2_as_expected(fit, scenes):
     """Chi2 (k,) with the priors as they were before any scene was fitted."""
     learned = fit.population.penalty(scenes, fit.theta)
     return fit.chi2[scenes] - learned + fit.expected.penalty(scenes, fit.theta)
-
-
-def _run_from_large_galaxies(fit, scenes):
-    """Fits scenes of a ProfileFit again from large galaxies; the better fit of each stays.
-
-    Scenes in which no larger profile has more of the light keep the first fit; where the large
-    galaxies are those that grew in it, or were large in an earlier fit, it goes on, with less
-    doubt of similar ones.
-    """
-    before, chi2 = fit._copy(), _chi2_as_expected(fit, scenes)
-    grown = _growth(fit)[scenes] > MIN_GROWTH
-    fit.theta[scenes] = fit.expected.mean[scenes]
-    fit.population.reset(scenes, fit.expected)
-    fit.population.own_light[scenes] = OWN_LIGHT
-    fit._look(scenes, fit.theta, slopes=False)
-    fit.looking.solve(MODEL_ERROR)
-    large = first_profiles(fit, scenes, MODEL_ERROR)[scenes]
-    some, same = large.any(axis=1), (large == grown).all(axis=1)
-    same |= fit.is_known[scenes] & ~(large & ~grown).any(axis=1)
-    fit._restore(before, scenes[same | ~some])
-    fit.population.own_light[scenes[some]] = OWN_LIGHT
-    fit._take(scenes[some])
-    fit._step(scenes[some], learn=True)
-    better = some & (_chi2_as_expected(fit, scenes) < chi2)
-    fit._restore(before, scenes[~better])
-    fit.population.own_light[scenes[some]] = OWN_LIGHT
-    fit._take(scenes[some & ~better])
-    fit._step(scenes[~better & fit.is_paused[scenes]], learn=True)
 
 
 def _run_without_doubt(fit, scenes):
