@@ -76,7 +76,7 @@ def test_a_fit_goes_on_where_another_ended(ended, device):
 
 
 def test_structure_of_another_galaxy_is_not_taken(ended, device):
-    """Where the profiles alone describe the data better the fit begins with them."""
+    """The fit begins with profiles alone if they describe the data better."""
     scene, first = ended
     ((own,), other) = first.structures
     strange = replace(own, coefficients=tuple(-9 * z for z in own.coefficients))

@@ -39,7 +39,9 @@ ROUGH_ITERATIONS = 60
 # clumps or neighbours and the galaxy. After 150 their groups have all of it: in `simulate field
 # --sky bright`, seed 1, the light within 3 half-light radii of each of six galaxies is 0.98 to 1.02
 # of the truth.
-LARGE, LARGE_ITERATIONS = 500_000, 100
+LARGE, LARGE_ITERATIONS = 500_000, 150
+# The same for fits that go on from the structure of an earlier one: they begin where that ended.
+CONTINUED_ITERATIONS = 100
 # Chi2 per pixel of a fit above which its residuals are not searched: they then show errors of the
 # model, with dozens of peaks, for example around a star with a wrong PSF. Large galaxies with
 # clumps have up to 10 in a first fit.
@@ -199,7 +201,8 @@ def _fits(job, blends, rough=None):
     device, sizes = get_device(job.device), {}
     for i, blend in enumerate(blends):
         frame = blend.frame.shape
-        limits = bool(rough and rough[i]), is_large(len(blend.sources), frame)
+        large, continued = is_large(len(blend.sources), frame), bool(blend.structures)
+        limits = bool(rough and rough[i]), large, continued
         sizes.setdefault((limits, frame, *(o.shape for o in blend.observations)), []).append(i)
     results: list = [None] * len(blends)
     for (limits, *_), alike in sizes.items():  # all at once, those of one size would be padded too
@@ -215,15 +218,16 @@ def _fits(job, blends, rough=None):
     return results
 
 
-def _settings(job, rough, large):
-    """Settings of rough fits, and of those of large blends.
+def _settings(job, rough, large, continued):
+    """Settings of rough fits, and of those of large blends, which may be `continued` ones.
 
     The paper's method needs all its iterations.
     """
     settings = job.settings
     if not isinstance(settings, Settings) or not (rough or large):
         return settings
-    most = min(settings.max_iter, ROUGH_ITERATIONS if rough else LARGE_ITERATIONS)
+    most = CONTINUED_ITERATIONS if continued else LARGE_ITERATIONS
+    most = min(settings.max_iter, ROUGH_ITERATIONS if rough else most)
     return replace(settings, max_iter=most, errors=settings.errors and not rough)
 
 
