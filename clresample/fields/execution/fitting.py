@@ -40,7 +40,9 @@ ROUGH_ITERATIONS = 60
 # --sky bright`, seed 1, the light within 3 half-light radii of each of six galaxies is 0.98 to 1.02
 # of the truth.
 LARGE, LARGE_ITERATIONS = 500_000, 150
-# The same for fits that go on from the structure of an earlier one: they begin where that ended.
+# The same for fits that go on from the structure of an earlier one, which begin where that ended:
+# the same field's six groups have 0.96 to 1.04 of the truth then, and 0.90 to 1.10 after 150
+# iterations from smooth profiles.
 CONTINUED_ITERATIONS = 100
 # Chi2 per pixel of a fit above which its residuals are not searched: they then show errors of the
 # model, with dozens of peaks, for example around a star with a wrong PSF. Large galaxies with
