@@ -32,6 +32,8 @@ class Blend:
         because the profiles of the first came from images that disagreed
     thetas (S): `Result.thetas` of an earlier fit of these sources on a frame of the same pixels,
         None or () for sources that it did not have; their profiles start from them. (): for none
+    structures (S): `Result.structures` of that fit, likewise; structure and strengths start from
+        them where they describe the data better than the profiles alone
     """
 
     observations: tuple[Observation, ...]
@@ -39,6 +41,7 @@ class Blend:
     frame: Frame | None = None
     shifts: np.ndarray | None = None
     thetas: tuple = ()
+    structures: tuple = ()
 
     def check(self):
         """Raises ValueError if an observation, a source or the frame has another type."""
@@ -49,11 +52,12 @@ class Blend:
         if self.frame is not None:
             check_instance("frame", self.frame, Frame)
         n = len(self.sources)
-        if len(self.thetas) not in (0, n):
-            raise ValueError(
-                f"thetas has {len(self.thetas)} entries, must have one for each of {n} sources or "
-                "none: pass Result.thetas of a fit of the same sources"
-            )
+        for name in ("thetas", "structures"):
+            if (n_entries := len(getattr(self, name))) not in (0, n):
+                raise ValueError(
+                    f"{name} has {n_entries} entries, must have one for each of {n} sources or "
+                    f"none: pass Result.{name} of a fit of the same sources"
+                )
         for i, own in enumerate(self.thetas):
             for theta in () if own is None else own:
                 if np.ndim(theta) != 1 or not np.isfinite(theta).all():

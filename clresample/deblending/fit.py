@@ -15,7 +15,8 @@ from .ended import Ended
 from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
 from .result import Component, Result
-from .solver.scene import image_numbers, signature_of
+from .solver.scene import ComponentStructure, image_numbers, signature_of
+from .start.carried_structure import carry_structure
 from .start.final_render import MorphologyModel, RenderedModel, render_models
 from .start.first_scene import first_scene
 from .start.profile_start import (
@@ -104,14 +105,19 @@ class Fit:
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
-        self._first_shifts = self.shifts
+        self._first_shifts, self._going_on = self.shifts, None
         self.restart()
         self.seconds["setup"] += seconds + time.perf_counter() - began
+
+    def go_on_from(self, state):
+        """Replaces the state at the start, here and in `restart`."""
+        self.state = self._going_on = state
 
     def restart(self):
         """Restores the state of the fit at the end of `begin`."""
         self.shift(self._first_shifts)
         self.scene, self.state = first_scene(self)
+        self.state = self._going_on or self.state
         self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
         self.last_steps = np.zeros_like(self.shifts)
 
@@ -178,7 +184,8 @@ class Fit:
             shifts=self.shifts,
             losses=np.array(self.losses),
             status=self.status,
-            thetas=_thetas(self),
+            thetas=_by_source(self, self.start.thetas),
+            structures=_structures(self),
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
@@ -192,6 +199,7 @@ def start_fits(fits):
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
         fit.begin(point, seconds)
+    carry_structure([fit for fit in fits if fit.blend.structures])
 
 
 def render_fits(fits) -> list[RenderedModel]:
@@ -253,12 +261,32 @@ def _inside(frame, positions):
     ]
 
 
-def _thetas(fit):
-    """Parameters of a fit's profiles, see Result."""
+def _by_source(fit, values):
+    """Values (n) of a fit's components as a tuple for each source."""
     found: list[tuple] = [()] * len(fit.sources)
-    for i, theta in zip(fit.fitted[fit.start.source], fit.start.thetas, strict=True):
-        found[i] += (theta,)
+    for i, value in zip(fit.fitted[fit.start.source], values, strict=True):
+        found[i] += (value,)
     return tuple(found)
+
+
+def _structures(fit):
+    """See Result.structures."""
+    if (learned := fit.state.learned) is None:
+        return ()
+    rows = zip(
+        fit.scene.origin.tolist(), learned.structure, learned.strengths, learned.clear, strict=True
+    )
+    return _by_source(
+        fit,
+        [
+            None
+            if fixed
+            else ComponentStructure(
+                tuple(origin), tuple(z.astype(np.float32) for z in scales), alpha, bool(clear)
+            )
+            for fixed, (origin, scales, alpha, clear) in zip(fit.scene.fixed, rows, strict=True)
+        ],
+    )
 
 
 def _rendered(fit, seen):

@@ -75,6 +75,9 @@ class Result(ResultDisplay):
     thetas (S): of each source a tuple of its components' parameters (n,), of the smooth profiles
         from which the fit began; another fit of these sources may start from them, see Blend. ():
         of a result that was read
+    structures (S): of each source a tuple of its components' ComponentStructures, None for fixed
+        ones; another fit of these sources may go on from them too. (): of other priors, and of a
+        result that was read
     messages: for the user, a line each; seconds: wall time by stage
     """
 
@@ -91,6 +94,7 @@ class Result(ResultDisplay):
     errors: Errors | None = None
     draws: PosteriorSampler | None = None
     thetas: tuple = ()
+    structures: tuple = ()
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 

@@ -11,7 +11,7 @@ from clresample.deblending.ended import Ended
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
-from clresample.deblending.start.final_render import RenderedModel
+from clresample.deblending.start.final_render import RenderedModel, model_of
 from clresample.sky.sources import ExtendedSource, PointSource
 
 
@@ -192,7 +192,7 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
         padded=SimpleNamespace(shape=(40, 41)),
         views=["a", "b"],
     )
-    model = colour_gradient.model_of(fit, [2, 0])
+    model = model_of(fit, [2, 0])
     assert (
         model.frame == (40, 41)
         and model.views == ["a", "b"]

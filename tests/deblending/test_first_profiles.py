@@ -148,3 +148,29 @@ def test_profiles_do_not_depend_on_the_other_scenes(device, monkeypatch):
     gains.clear()
     start_fits([fit_of([STAR, GIANT]), fit_of([GIANT])])
     np.testing.assert_allclose(gains[0], alone, rtol=1e-4)
+
+
+def test_large_galaxies_of_an_earlier_fit_are_no_reason_for_a_second_start(sized, monkeypatch):
+    """Unless the grid names another one that had not grown."""
+    real, trials = profile_fit.ProfileFit._step, []
+
+    def step(fit, scenes, *given, **options):
+        fit.is_known[:] = is_known[0]
+        if options.get("learn"):
+            trials.append(fit.theta[0, :, 0].copy())
+        real(fit, scenes, *given, **options)
+
+    monkeypatch.setattr(profile_fit.ProfileFit, "_step", step)
+    small = (84.0, 12.0), (9000, 8000, 7000), 1.5
+    objects, numbers = [GIANT, ((24.0, 70.0), (4e4, 3e4, 3e4), 9.0), small], []
+    is_known = [False]
+    for is_known[0], large in ((False, [0]), (True, [0]), (True, [2])):
+        trials.clear()
+
+        def instead(fit, scenes, _error, large=large):
+            fit.theta[scenes, :, 0] = -9.0
+            return np.isin(fit.source, large)
+
+        sized(objects, instead)
+        numbers.append(bool((trials[1] == -9).any()))
+    assert numbers == [True, False, True]

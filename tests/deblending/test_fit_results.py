@@ -9,6 +9,7 @@ import pytest
 from clresample.deblending import fit as room
 from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.fit import Fit
+from clresample.deblending.solver.scene import StructureState
 
 UNIT = np.array([2.0, 10.0, 0.5])
 CHANNELS = slice(0, 1), slice(1, 3)
@@ -26,6 +27,9 @@ def ended(noise=(None, "correlated")):
         covered = rng.random(shape) > 0.3
         observations.append(SimpleNamespace(data=data, noise=n))
         views.append(SimpleNamespace(covered=covered))
+    learned = StructureState(
+        [[rng.random((2, k))] for k in (1, 2, 3)], rng.random((3, 1)), np.arange(3) > 0
+    )
     fit = SimpleNamespace(
         blend=SimpleNamespace(observations=tuple(observations)),
         frame="frame", geometry="home", sources=tuple("abcdef"), views=views, unit=UNIT,
@@ -33,8 +37,10 @@ def ended(noise=(None, "correlated")):
         padded=SimpleNamespace(shape=(24, 32)),
         fitted=np.array([3, 5]),
         start=SimpleNamespace(source=np.array([1, 1, 0]), thetas=["p", "q", "r"]),
-        scene=SimpleNamespace(origin=np.array([(1, 2), (3, 4), (5, 6)])),
-        state=SimpleNamespace(morph=morphs),
+        scene=SimpleNamespace(
+            origin=np.array([(1, 2), (3, 4), (5, 6)]), fixed=np.array([False, False, True])
+        ),
+        state=SimpleNamespace(morph=morphs, learned=learned),
         shifts=np.array([(0, 0), (0.1, 0.2)]), losses=[3.0, 2.0], status="converged",
         messages=["one"], seconds={"result": 1.0, "fit": 2.0},
         settings=SimpleNamespace(fit_sky="whether"),
@@ -91,6 +97,15 @@ def test_results_are_in_counts_and_have_maxima_of_1(monkeypatch, bare):
     assert (found.errors, found.status) == ("errors", "converged")
     assert (found.frame, found.sources, found.messages) == ("frame", tuple("abcdef"), ("one",))
     assert found.thetas == ((), (), (), ("r",), (), ("p", "q"))
+    assert [len(own) for own in found.structures] == [0, 0, 0, 1, 0, 2]
+    learned, own = fit.state.learned, found.structures[5]
+    assert found.structures[3] == (None,) and [one.clear for one in own] == [False, True]
+    for k, one in enumerate(own):
+        np.testing.assert_allclose(one.coefficients[0], learned.structure[k][0], rtol=1e-6)
+        assert one.origin == found.components[k].origin
+        assert one.strengths.tolist() == learned.strengths[k].tolist()
+    fit.state.learned = None  # of another prior
+    assert Fit.result(fit, seen).structures == ()
     assert found.losses.tolist() == [3, 2] and found.shifts is fit.shifts
     assert found.observations is fit.blend.observations
     assert found.seconds["fit"] == 2 and 1 < found.seconds["result"] < 2
@@ -124,12 +139,16 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     fits = [
         SimpleNamespace(
-            patch=k, settings=SimpleNamespace(fit_sky=100), begin=lambda *given: asked.append(given)
+            patch=k,
+            settings=SimpleNamespace(fit_sky=100),
+            begin=lambda *given: asked.append(given),
+            blend=SimpleNamespace(structures=(k,) * k),
         )
         for k in range(3)
     ]
+    monkeypatch.setattr(room, "carry_structure", asked.append)
     room.start_fits(fits)
-    assert asked == [(100, 2.0), (101, 2.0), (102, 2.0)]
+    assert asked == [(100, 2.0), (101, 2.0), (102, 2.0), fits[1:]]
 
 
 def test_memory_of_a_fit_holds_what_its_solver_takes():

@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from helpers.fields import mosaics_of
 
+from clresample.deblending.solver.scene import ComponentStructure
 from clresample.fields.blends.plan import FitRegion
 from clresample.fields.execution.group_results import (
     COMPONENT_COLUMNS,
@@ -103,10 +104,39 @@ def test_profiles_come_back_digit_by_digit_of_the_patches_asked_for(part, tmp_pa
     assert file.profiles({8}) == {14: (one,)} and file.profiles(()) == {}
 
 
+def test_structure_comes_back_of_the_patch_asked_for(part, tmp_path):
+    """In the pixels of its frame; components without structure keep their places."""
+    rng = np.random.default_rng(0)
+    one, two = (
+        ComponentStructure(
+            (k, 2 * k), (rng.random((2, k)), rng.random((k, 1))), rng.random(2), k > 1
+        )
+        for k in (1, 2)
+    )
+    rows = (
+        (11, PATCH, one),
+        (12, PATCH, None),
+        (11, PATCH, two),
+        (13, replace(PATCH, number=8), one),
+    )
+    for number, patch, own in rows:
+        origin = np.array([30, 40]) + (own or one).origin
+        part.add_component(number, patch, origin, np.ones((2, 3)), np.ones(2), (), own)
+    file, _ = read(part, tmp_path)
+    found = file.structures(7, (30, 40))
+    assert list(found) == [11, 12] and found[12] == (None,)
+    for back, own in zip(found[11], (one, two), strict=True):
+        assert back.origin == own.origin and back.clear is own.clear
+        np.testing.assert_array_equal(back.strengths, own.strengths)
+        for z, wanted in zip(back.coefficients, own.coefficients, strict=True):
+            np.testing.assert_array_equal(z, wanted.astype(np.float32))
+    assert file.structures(9, (0, 0)) == {}
+
+
 def test_an_empty_part_is_a_file_too(tmp_path):
     file, _ = read(GroupResults(), tmp_path)
     assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
-    assert list(file.models()) == [] and file.profiles({7}) == {}
+    assert list(file.models()) == [] and file.profiles({7}) == {} == file.structures(7, (0, 0))
 
 
 def test_files_are_fits_as_others_see_them(part, tmp_path):

@@ -93,20 +93,21 @@ def test_a_large_piece_has_many_pixels_times_sources():
 
 
 @pytest.mark.parametrize(
-    "rough, large, given, most, errors",
+    "rough, large, continued, given, most, errors",
     [
-        (True, False, {}, 60, False),
-        (True, True, {}, 60, False),
-        (False, True, {}, 150, True),
-        (False, False, {}, 500, True),
-        (True, False, {"max_iter": 10}, 10, False),
+        (True, False, False, {}, 60, False),
+        (True, True, False, {}, 60, False),
+        (False, True, False, {}, 150, True),
+        (False, True, True, {}, 100, True),
+        (False, False, True, {}, 500, True),
+        (True, False, False, {"max_iter": 10}, 10, False),
     ],
 )
-def test_rough_and_large_fits_have_few_iterations(rough, large, given, most, errors):
-    settings = _settings(SimpleNamespace(settings=Settings(**given)), rough, large)
+def test_rough_and_large_fits_have_few_iterations(rough, large, continued, given, most, errors):
+    settings = _settings(SimpleNamespace(settings=Settings(**given)), rough, large, continued)
     assert (settings.max_iter, settings.errors) == (most, errors)
     paper = PaperSettings()
-    assert _settings(SimpleNamespace(settings=paper), rough, large) is paper
+    assert _settings(SimpleNamespace(settings=paper), rough, large, continued) is paper
 
 
 @pytest.mark.parametrize("siblings, fitted, left", [((), 1, 0), ((1,), 0, 1)])
@@ -126,6 +127,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
             status=Ended.CONVERGED,
             sources=(known,),
             thetas=(("its profile",),),
+            structures=(("its structure",),),
         )
         for x in (4900.0, 5100.0)
     )
@@ -152,6 +154,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     assert [b.sources[1].position_px for b in blends] == [(5.0, 7.0)] * fitted
     assert [[s.name for s in b.sources] for b in blends] == [["76", "77"]] * fitted
     assert [b.thetas for b in blends] == [(("its profile",), ())] * fitted
+    assert [b.structures for b in blends] == [(("its structure",), ())] * fitted
 
 
 def test_what_was_found_is_carried_from_round_to_round(tmp_path):

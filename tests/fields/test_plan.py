@@ -138,11 +138,16 @@ def test_sources_go_on_from_the_profiles_of_an_earlier_fit(single, counts):
     star = PointSource(position_px=(9, 0), name="20", free_position=True)
     own, two = ((1.0, 0, 0, 2.0),), ((0.5, 0, 0, 2.0), (1.5, 0, 0, 2.0))
     blend = with_profiles(
-        Blend((), (*galaxies, star)), {10: own, 11: two, 20: ((0.1, 0.2),)}, single=single
+        Blend((), (*galaxies, star)),
+        {10: own, 11: two, 20: ((0.1, 0.2),)},
+        {11: ("two", "structures")},
+        single=single,
     )
     assert [source.n_components for source in blend.sources[:3]] == counts
     assert blend.sources[3] == star
     assert blend.thetas == (own, two, (), ((0.1, 0.2),))
+    assert blend.structures == ((), ("two", "structures"), (), ())
+    assert with_profiles(blend, {}, {}, single=single).structures == ()
 
 
 def test_ids_do_not_depend_on_the_run_and_say_where():

@@ -184,10 +184,11 @@ def cut(done, sky, tmp_path_factory):
     options, folder = FieldOptions(limits=FitLimits(max_sources=largest - 1)), tmp_path_factory
     folder, given, with_profiles = folder.mktemp("cut"), [], fitting.with_profiles
 
-    def noted(blend, profiles, *, single):
-        blend = with_profiles(blend, profiles, single=single)
+    def noted(blend, profiles, structures, *, single):
+        blend = with_profiles(blend, profiles, structures, single=single)
         counts = [s.n_components for s in blend.sources]
         given.append((bool(profiles), counts, [len(own) for own in blend.thetas]))
+        assert bool(profiles) == bool(structures)
         return blend
 
     with pytest.MonkeyPatch.context() as patch:

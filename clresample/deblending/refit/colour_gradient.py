@@ -20,7 +20,7 @@ import numpy as np
 
 from ...sky.sources import ExtendedSource
 from ..component_images import ComponentImages, local_chi2
-from ..start.final_render import MorphologyModel, render_models
+from ..start.final_render import model_of, render_models
 
 # Relative scatter of the core's spectrum about that of the whole source: 0.3 mag, as between bulges
 # and discs. With half or twice that, evidences differ by a few; gradients over 3 % are detected in
@@ -90,17 +90,6 @@ def _is_free(source):
         and source.n_components is None
         and source.profile is None
     )
-
-
-def model_of(fit, which=()):
-    """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
-    scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
-    cores = [morphs[i] * scene.profile[i] for i in which]
-    source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
-    bare = [None] * len(fit.views)
-    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
-    given = source, origin, morphs + cores, spectra, fit.state.sky
-    return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 
 
 def _asked(fit, which, seen):

@@ -17,10 +17,10 @@ from ..ended import Ended
 from ..profiles import COMPONENT_SPREAD, FixedProfile, GalaxyProfile
 from ..solver.multiscale.structure import coarse_count
 from ..solver.scene import StructureState
-from ..start.final_render import render_models
+from ..start.final_render import best_starts
 from ..start.first_scene import first_scene
 from ..start.profile_start import StartInput, fit_start_profiles, profile_peak
-from .colour_gradient import model_of, run_gradient_tests
+from .colour_gradient import run_gradient_tests
 
 # Ratio of the sigma of an added core to that of its component: that of a Gaussian's square, which
 # is the core in the test of colours.
@@ -58,23 +58,7 @@ def start_refits(fits):
         beside = _again(first, _with_cores(first, one))
         beside.state = _going_on(beside.state, first, *_cores(len(first.start), one.significant))
         starts.append((known, whole, beside))
-    return dict(zip(asked, _best(starts, fit_sky), strict=True))
-
-
-def _best(starts, fit_sky):
-    """Selects of each scene's Fits at their starts the one with the lowest chi2.
-
-    All scenes have equally many starts, compared with their best spectra and sky.
-    """
-    fits = [fit for of_scene in starts for fit in of_scene]
-    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
-    for fit, seen in zip(fits, images, strict=True):
-        residuals = seen.residuals(fit.scene.channels(), fit.views)
-        pairs = zip(fit.views, residuals, strict=True)
-        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
-        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
-    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
-    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
+    return dict(zip(asked, best_starts(starts, fit_sky), strict=True))
 
 
 def _again(fit, point):

@@ -99,6 +99,21 @@ class StructureState:
 
 
 @dataclass(frozen=True, eq=False)
+class ComponentStructure:
+    """Structure of one component about its profile, from which another fit may go on.
+
+    origin (2,) [px]: first pixel of its box in the frame
+    coefficients (J): arrays z (ny_j, nx_j) of the scales in that box, see StructureState
+    strengths (J,), clear: see StructureState
+    """
+
+    origin: tuple[int, int]
+    coefficients: tuple[np.ndarray, ...]
+    strengths: np.ndarray
+    clear: bool
+
+
+@dataclass(frozen=True, eq=False)
 class State:
     """Variables of the iterations of one scene.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -138,6 +138,33 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
             )
         )
     return found
+
+
+def model_of(fit, which=()):
+    """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
+    scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
+    cores = [morphs[i] * scene.profile[i] for i in which]
+    source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
+    bare = [None] * len(fit.views)
+    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
+    given = source, origin, morphs + cores, spectra, fit.state.sky
+    return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
+
+
+def best_starts(starts, fit_sky):
+    """Selects of each scene's Fits at their starts the one with the lowest chi2.
+
+    All scenes have equally many starts, compared with their best spectra and sky.
+    """
+    fits = [fit for of_scene in starts for fit in of_scene]
+    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    for fit, seen in zip(fits, images, strict=True):
+        residuals = seen.residuals(fit.scene.channels(), fit.views)
+        pairs = zip(fit.views, residuals, strict=True)
+        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
+        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
+    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
+    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
 
 
 def _looking(views, components, fit_sky):

@@ -39,7 +39,7 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
-    brightness (N,): of the components, see `thresholds`
+    brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
@@ -57,6 +57,7 @@ class ProfileFit:
         self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
+        self.is_known = np.zeros(size[0], bool)
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -86,7 +87,7 @@ class ProfileFit:
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
 
         Scenes in which no larger profile has more of the light keep the first fit; where the large
-        galaxies are those that grew in it, it goes on, with less doubt of similar ones.
+        galaxies are those that grew in it, or some of an earlier fit's, it goes on with less doubt.
         """
         before, chi2 = self._copy(), _chi2_as_expected(self, scenes)
         grown = _growth(self)[scenes] > MIN_GROWTH
@@ -97,6 +98,7 @@ class ProfileFit:
         self.looking.solve(MODEL_ERROR)
         large = first_profiles(self, scenes, MODEL_ERROR)[scenes]
         some, same = large.any(axis=1), (large == grown).all(axis=1)
+        same |= self.is_known[scenes] & (large <= grown).all(axis=1)
         self._restore(before, scenes[same | ~some])
         self.population.own_light[scenes[some]] = OWN_LIGHT
         self._take(scenes[some])
@@ -257,6 +259,7 @@ def start_from(fit, known):
         fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
     scenes = np.unique(fit.looking.scene[galaxies])
     grown = _growth(fit)[scenes].max(axis=1) > MAX_GROWTH
+    fit.is_known[scenes] = True
     fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
 

@@ -65,20 +65,23 @@ def listed_source(patch, plan, s):
     return ExtendedSource(position_px=place, name=str(number))
 
 
-def with_profiles(blend, profiles, *, single):
-    """A Blend whose sources go on from profiles {id: parameters (n,) of each component}.
+def with_profiles(blend, profiles, structures, *, single):
+    """A Blend whose sources go on from an earlier fit of theirs on the same frame.
 
+    profiles {id: parameters (n,) of each component}; structures {id: ComponentStructure of each}
     Galaxies with several components keep their number; those with one get n_components=single. One
     that was fitted as a star has no parameters of a galaxy, and its number is open again.
     """
-    sources, thetas = [], []
+    sources, thetas, known = [], [], []
     for source in blend.sources:
         own = profiles.get(int(source.name), ())
         if own and len(own[0]) == N_PARAMETERS and isinstance(source, ExtendedSource):
             source = replace(source, n_components=len(own) if len(own) > 1 else single)
         sources.append(source)
         thetas.append(own)
-    return replace(blend, sources=tuple(sources), thetas=tuple(thetas))
+        known.append(structures.get(int(source.name), ()))
+    given = {"thetas": tuple(thetas), "structures": tuple(known) if structures else ()}
+    return replace(blend, sources=tuple(sources), **given)
 
 
 def fit_box(mosaic, grid) -> Box:

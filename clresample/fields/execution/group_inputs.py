@@ -18,7 +18,7 @@ class FitGroup:
         pieces
     neighbour_models: (patch, name of a file of results, weight) for each neighbour's model that is
         subtracted; the weights of a patch add up to 1
-    profiles: (id, parameters (n,) of each component) of sources, as fitted in an earlier round
+    last_fits: (patch, name of a file of results) of the fits before, from which these go on
     found: (patch, id, y, x, id of the host) of sources that an earlier round detected in a patch's
         residuals, at (y, x) [px] of the field's model pixels
     """
@@ -27,7 +27,7 @@ class FitGroup:
     patches: tuple[int, ...]
     round: int = 0
     neighbour_models: tuple[tuple[int, str, float], ...] = ()
-    profiles: tuple[tuple[int, tuple[tuple[float, ...], ...]], ...] = ()
+    last_fits: tuple[tuple[int, str], ...] = ()
     found: tuple[tuple[int, int, float, float, int], ...] = ()
 
 
@@ -39,10 +39,13 @@ class GroupInputs:
         the model pixel `corner` on
     light {patch: {mosaic's name: [(Box, model (C, Ny, Nx) [counts])]}}: of the neighbours; None in
         the first round, where their pixels are ignored
+    before {patch: (profiles, structures)}: of the last fits, {id: of each component}, see
+        `with_profiles`
     """
 
     labels: dict
     light: dict | None
+    before: dict
 
 
 def gather_inputs(job, group) -> GroupInputs:
@@ -55,7 +58,11 @@ def gather_inputs(job, group) -> GroupInputs:
         there = Box(box.y0 - y, box.x0 - x, box.y1 - y, box.x1 - x).intersection(region)
         corner = there.y0 + y, there.x0 + x
         labels[number] = corner, np.array(whole[there.slices])
-    return GroupInputs(labels, None if group.round == 0 else _light(job, group))
+    before = {}
+    for number, name in group.last_fits:
+        file, box = GroupResultsFile(job.folder / f"{name}.fits"), job.plan.patches[number].box
+        before[number] = file.profiles({number}), file.structures(number, box[:2])
+    return GroupInputs(labels, None if group.round == 0 else _light(job, group), before)
 
 
 def _light(job, group):

@@ -10,6 +10,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 
+from ...deblending.solver.scene import ComponentStructure
 from ...deblending.start.equations import N_PARAMETERS
 from ...files.fits import open_fits
 from ...measurement.columns import DEFINITIONS, Columns, definitions
@@ -36,6 +37,7 @@ FOUND_COLUMNS = {
     "host": DEFINITIONS["group_id"],
 }
 COMPONENT_COLUMNS = ("id", "parent_id", "fit_id", "y0", "x0", "n_y", "n_x", "offset")
+SCALE_COLUMNS = ("component", "n_y", "n_x", "clear")
 MODEL_COLUMNS = ("fit_id", "mosaic", "y0", "x0", "y1", "x1", "offset")
 
 
@@ -47,6 +49,8 @@ class GroupResults:
     found: rows of FOUND_COLUMNS, sources in residuals, for the next round
     components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each; thetas:
         (N_PARAMETERS,) of each, of its profile, padded with NaN
+    scales: rows of SCALE_COLUMNS, of the structure of components that another round goes on from;
+        strengths: of each; coefficients: of these, flattened
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
         shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
@@ -59,6 +63,9 @@ class GroupResults:
     components: list = field(default_factory=list)
     spectra: list = field(default_factory=list)
     thetas: list = field(default_factory=list)
+    scales: list = field(default_factory=list)
+    strengths: list = field(default_factory=list)
+    coefficients: list = field(default_factory=list)
     flat: list = field(default_factory=list)
     models: list = field(default_factory=list)
     pixels: list = field(default_factory=list)
@@ -67,11 +74,17 @@ class GroupResults:
     n_pixels: int = 0
     n_failed: int = 0
 
-    def add_component(self, source_id, patch, origin, morphology, spectrum, theta):
+    def add_component(self, source_id, patch, origin, morphology, spectrum, theta, structure=None):
         """A component of a source: its box begins at `origin` (2,) of the field's model pixels.
 
-        theta (n,): parameters of its profile
+        theta (n,): parameters of its profile; structure: its ComponentStructure, None = not stored
         """
+        if structure is not None:
+            rows = zip(structure.coefficients, structure.strengths, strict=True)
+            for z, strength in rows:
+                self.scales.append((len(self.components), *z.shape, structure.clear))
+                self.strengths.append(strength)
+                self.coefficients.append(np.ravel(z).astype(np.float32))
         where = (source_id, patch.parent, patch.number, *origin, *morphology.shape, self.n_flat)
         self.components.append(tuple(map(int, where)))
         self.spectra.append(spectrum)
@@ -100,6 +113,9 @@ class GroupResults:
             _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
             _floats(self.spectra, "SPECTRA"),
             _floats(self.thetas, "THETAS"),
+            _table(_whole(self.scales, SCALE_COLUMNS), "SCALES"),
+            _floats(self.strengths, "STRENGTHS"),
+            _floats(self.coefficients and np.concatenate(self.coefficients), "COEFFICIENTS"),
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
             _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
             _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
@@ -168,6 +184,33 @@ class GroupResultsFile:
             if patch in chosen:
                 own = tuple(theta[np.isfinite(theta)].tolist())
                 found[source] = (*found.get(source, ()), own)
+        return found
+
+    def structures(self, patch, corner) -> dict[int, tuple]:
+        """ComponentStructures {id: of each component} of a patch's sources, None for those without.
+
+        corner (2,) [px]: first pixel of the patch's frame in the field's model pixels
+        """
+        table, scales, strengths, flat = self.read(
+            "COMPONENTS", "SCALES", "STRENGTHS", "COEFFICIENTS"
+        )
+        rows = np.stack([scales[name] for name in SCALE_COLUMNS], axis=1)
+        ends = np.cumsum(rows[:, 1] * rows[:, 2])
+        places = np.stack([table["y0"], table["x0"]], axis=1) - np.array(corner)
+        found: dict[int, tuple] = {}
+        for i, (source, number) in enumerate(self.owners()):
+            if number == patch:
+                own, one = np.flatnonzero(rows[:, 0] == i), None
+                if len(own):
+                    parts = (flat[ends[k] - rows[k, 1:3].prod() : ends[k]] for k in own)
+                    pairs = zip(parts, rows[own, 1:3], strict=True)
+                    one = ComponentStructure(
+                        tuple(places[i].tolist()),
+                        tuple(part.reshape(shape) for part, shape in pairs),
+                        strengths[own],
+                        bool(rows[own[0], 3]),
+                    )
+                found[source] = (*found.get(source, ()), one)
         return found
 
     def offsets(self) -> np.ndarray:

@@ -71,7 +71,7 @@ def fit_all_groups(job, engine, progress):
                 patches,
                 n_round,
                 history.light_about(patches),
-                history.profiles_of(patches),
+                tuple((n, history.names[n][-1]) for n in patches),
                 history.found_in(patches),
             )
             for i, patches in enumerate(groups)
@@ -139,17 +139,6 @@ class _PieceHistory:
     def found_in(self, patches):
         """`FitGroup.found` of some pieces: all that was found in their residuals so far."""
         return tuple(row for patch in patches for row in self.found.get(patch, ()))
-
-    def profiles_of(self, patches):
-        """`FitGroup.profiles` of some pieces, those of their last fits.
-
-        Numbers of components are not tested again in each round, because a borderline source would
-        alternate.
-        """
-        found: dict[int, tuple] = {}
-        for name in sorted({self.names[patch][-1] for patch in patches}):
-            found |= _file(self.job, name).profiles(patches)
-        return tuple(sorted(found.items()))
 
     def moved(self, patches):
         """Pieces whose flux changed by over MAX_FLUX_CHANGE_SIGMA errors since their fit before.
