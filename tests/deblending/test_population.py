@@ -61,14 +61,34 @@ def test_a_galaxy_unlike_the_others_counts_for_little():
     """Three times as large as five others, it moves what is expected of these by 3 % of that."""
     off, known = np.zeros((1, 7, 2)), np.ones((1, 7), bool)
     off[0, 0], off[0, 6], known[0, 6] = np.log(3), 5.0, False  # the last one is no galaxy
-    common, own = np.zeros((1, 2)), GALAXY_SCATTER[None].copy()
+    common, own, scatter = np.zeros((1, 2)), GALAXY_SCATTER[None].copy(), GALAXY_SCATTER
     for _ in range(10):
-        common, own, scatter = em_step(off, np.full_like(off, 0.01), known, common, own)
+        variance = np.broadcast_to(shrunk(off, 0.1, 0, scatter)[1], off.shape)
+        common, own, scatter = em_step(off, variance, known, common, own)
     assert 0 < common[0, 0] < 0.03 * np.log(3) and own[0, 0] == pytest.approx(
-        GALAXY_SCATTER[0], rel=0.02
+        GALAXY_SCATTER[0], rel=0.05
     )
     # nor is it held to be like them
     assert scatter[0, 0, 0] > 2.5 * own[0, 0] > 2.5 * scatter[0, 1, 0]
+
+
+def learned(data, noise):
+    """c and s of one scene of galaxies, whose values (n,) were measured with some noise (n,)."""
+    data, noise = (np.repeat(a, 2).reshape(1, -1, 2).astype(float) for a in (data, noise))
+    common, own, scatter = np.zeros((1, 2)), GALAXY_SCATTER[None].copy(), GALAXY_SCATTER
+    known = np.ones(data.shape[:2], bool)
+    for _ in range(30):
+        posterior = shrunk(data, noise, common[:, None], scatter)
+        common, own, scatter = em_step(*posterior, known, common, own)
+    return common[0, 0], own[0, 0]
+
+
+def test_a_faint_galaxy_beside_known_ones_changes_nothing_and_among_faint_ones_it_counts():
+    """The size of one with signal to noise 5 is known within a factor of two."""
+    alone, beside = learned([0.4, 0.5], [0.05, 0.1]), learned([0.4, 0.5, -0.4], [0.05, 0.1, 0.7])
+    assert np.abs(np.subtract(beside, alone)).max() < 0.015
+    few, more = learned([0.4, 0.4], [0.7, 0.7]), learned([0.4] * 8, [0.7] * 8)
+    assert 1.5 * few[0] < more[0] < 0.4
 
 
 def test_only_whole_galaxies_of_scenes_with_several_are_learned_from():

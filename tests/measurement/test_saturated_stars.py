@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
+from scipy.signal import fftconvolve
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.inspection.star_cores import star_cores
@@ -30,6 +31,9 @@ def moffat(y, x):
     return value * (BETA - 1) / (np.pi * radius**2)
 
 
+PSF_IMAGE = moffat(np.arange(-12.0, 13.0)[:, None], np.arange(-12.0, 13.0))
+
+
 def starry(*, spikes=True, galaxy=True, seed=1, place=GALAXY, sigma_px=GALAXY_SIGMA):
     """An Observation of a saturated star with bleeds, masked, whose PSF image is a small one."""
     y, x = np.indices(SHAPE)
@@ -40,16 +44,14 @@ def starry(*, spikes=True, galaxy=True, seed=1, place=GALAXY, sigma_px=GALAXY_SI
         for a, b in ((along, across), (across, along)):
             data += 150 * np.exp(-np.abs(a) / 20 - 0.5 * (b / 1.7) ** 2)
     if galaxy:
-        s2 = sigma_px**2 + (FWHM / 2.3548) ** 2
         away = (y - place[0]) ** 2 + (x - place[1]) ** 2
-        data += GALAXY_FLUX * np.exp(-away / (2 * s2)) / (2 * np.pi * s2)
+        light = GALAXY_FLUX * np.exp(-away / (2 * sigma_px**2)) / (2 * np.pi * sigma_px**2)
+        data += fftconvolve(light, PSF_IMAGE / PSF_IMAGE.sum(), mode="same")
     full = saturate(data, LEVEL)
     data += np.random.default_rng(seed).normal(0, NOISE, SHAPE)
-    n = np.arange(25) - 12.0
-    psf = PSF(moffat(n[:, None], n))
     return Observation(
         data,
-        psf,
+        PSF(PSF_IMAGE),
         Grid.flat(SHAPE, 0.26),
         weights=np.where(binary_dilation(full, np.ones((3, 3))), 0, NOISE**-2),
         channels=("r",),
@@ -150,7 +152,7 @@ def test_detection_finds_a_point_and_the_galaxy_and_no_spikes(fits):
     grid = starry().grid
     at = [fits.found.frame.grid.positions_in(grid, *s.position_px) for s in fits.found.sources]
     assert np.hypot(*(at[0] - STAR)) < 0.7
-    assert np.hypot(*(at[1] - GALAXY)) < 2.5
+    assert np.hypot(*(at[1] - GALAXY)) < 3.5
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["detected", "listed as a galaxy"])
@@ -169,13 +171,14 @@ def test_its_wings_and_spikes_are_its_own(fits, which):
     assert error < 0.2 * FLUX
 
 
-def test_the_wings_of_a_wide_galaxy_are_not_the_stars():
-    place = STAR[0] - 14.4, STAR[1] + 19.2
+@pytest.mark.parametrize("away", [24.0, 16.0])
+def test_the_wings_of_a_wide_galaxy_are_not_the_stars(away):
+    place = STAR[0] - 0.6 * away, STAR[1] + 0.8 * away
     observation = starry(spikes=False, place=place, sigma_px=3.5)
     listed = [ExtendedSource(position_px=at) for at in (STAR, place)]
     table = catalogue(deblend([observation], listed))
-    flux = float(getattr(table["flux_r"][1], "value", table["flux_r"][1]))
-    assert flux == pytest.approx(GALAXY_FLUX, rel=0.06)
+    flux, error = (float(getattr(v, "value", v)) for v in table["flux_r", "flux_err_r"][1])
+    assert abs(flux - GALAXY_FLUX) < max(3 * error, 0.06 * GALAXY_FLUX)
 
 
 def test_a_ray_of_one_band_is_no_source_and_a_star_of_both_is():

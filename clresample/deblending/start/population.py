@@ -7,7 +7,12 @@ A galaxy's ln sigma and ln beta, its size and the width of its wings, follow
 with c and s common to the scene. Faint galaxies are then similar to the others of their scene. A
 galaxy unlike all others, a bright spiral among faint ones, has little weight. Both c and s are
 updated by a step of expectation and maximisation (Dempster, Laird & Rubin 1977, J. R. Stat. Soc. B
-39, 1) after each step of the fit.
+39, 1) after each step of the fit. With
+
+    f_i = 1 / (1 + v_i / s^2),    v_i the variance of theta_i of the data alone,
+
+the step has the factor f_i / max f for a galaxy, and its square for s: a faint galaxy beside better
+known ones, which is as the prior expects, neither keeps c and s where they are nor changes them.
 
 Errors in the models of neighbours can mimic the shape of a galaxy. Real galaxies differ from smooth
 profiles by a tenth of their light and more, with correlated differences over many pixels. The
@@ -43,6 +48,8 @@ LEARNED = np.array([0, 3])
 SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.5]), np.array([0.2, 0.5]), 4.0
 # Smallest number of galaxies in a scene for which the prior is updated.
 MIN_GALAXIES = 2
+# [1] Smallest information of a scene's best known galaxy relative to which others count.
+MIN_INFORMATION = 0.01
 # Degrees of freedom. With 4, one galaxy three times as large as five others does not change the
 # prior of these; with a Gaussian their scatter would grow from 0.2 to 0.35. Fits of simulated
 # galaxies are equal with both.
@@ -175,8 +182,14 @@ def em_step(off, variance, known, common, own):
     """
     known, away = known[..., None], (off - common[:, None]) ** 2 + variance
     weight = (STUDENT_DOF + 1) / (STUDENT_DOF + away / own[:, None] ** 2)
-    counted = weight * known
-    common = (counted * off).sum(1) / (counted.sum(1) + (own / SCENE_SCATTER) ** 2)
-    away = counted * ((off - common[:, None]) ** 2 + variance)
-    own = np.sqrt((WEIGHT * GALAXY_SCATTER**2 + away.sum(1)) / (WEIGHT + known.sum(1)))
+    data = known * np.maximum(own[:, None] ** 2 / variance - weight, 0)
+    informed, relative = data / (data + weight), data / (data + 1)
+    relative /= np.maximum(relative.max(axis=1, keepdims=True), MIN_INFORMATION)
+    counted = weight * relative
+    # of the data alone: (off - common) / informed + common
+    right = (counted * (off - (1 - informed) * common[:, None])).sum(1)
+    common = right / ((counted * informed).sum(1) + (own / SCENE_SCATTER) ** 2)
+    away = counted * relative * ((off - common[:, None]) ** 2 + variance)
+    n_counted = np.square(relative).sum(1)
+    own = np.sqrt((WEIGHT * GALAXY_SCATTER**2 + away.sum(1)) / (WEIGHT + n_counted))
     return common, own, own[:, None] / np.sqrt(weight)
