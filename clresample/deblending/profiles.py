@@ -110,14 +110,14 @@ def draw_psf(psf: PSF, position, shape, *, slopes=True):
     """The PSF at a sub-pixel position and its derivatives by (y, x) (3, ny, nx), unit integral.
 
         S(x) = K^-2 sum_nu P^(nu) e(nu_y, c_y) e(nu_x, c_x) exp(2 pi i nu.x),    K > n + its extent
-        e(nu, c) = w exp(-2 pi i nu c) + (1 - w) exp(-2 pi i (nu - sign nu) c),    w at |nu|
+        e(nu, c) = sum_m w_m exp(-2 pi i (nu + m) c),    w_m ~ G^(nu + m),    m = -1, 0, 1
 
     slopes: with the derivatives; else (1, ny, nx)
 
-    In a frame's pixels waves of nu and nu - sign nu are one. Of P^, the part w is that of nu, for a
-    Gaussian of the PSF's second moment. Without the other part e would jump at Nyquist's frequency,
-    and a star between two pixels have lines of alternating sign along both axes, as far as the
-    frame: at 60 px, 20 sigma of a saturated star of Euclid.
+    On a frame's pixels waves of nu and nu + m are one. Their parts w_m of P^ are those of a Gaussian
+    G of the PSF's second moment. With that of nu alone, e jumps at Nyquist's frequency, and a star
+    between two pixels has lines of alternating sign along both axes, as far as the frame: at 60 px,
+    20 sigma of a saturated star of Euclid.
     """
     extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
     n_fft = max(shape) + 2 * extent + 1
@@ -133,12 +133,10 @@ def draw_psf(psf: PSF, position, shape, *, slopes=True):
 
 def _shift(nu, c, variance):
     """e (K,) of `draw_psf` and its derivative by c; variance [px^2]: of the PSF along this axis."""
-    own = 1 / (1 + np.exp(-2 * np.pi**2 * variance * (1 - 2 * np.abs(nu))))
-    found, by_c = np.zeros((2, len(nu)), complex)
-    for part, at in ((own, nu), (1 - own, nu - np.sign(nu))):
-        wave = part * np.exp(-2j * np.pi * at * c)
-        found, by_c = found + wave, by_c - 2j * np.pi * at * wave
-    return found, by_c
+    at = nu + np.array([-1, 0, 1])[:, None]
+    part = np.exp(-2 * np.pi**2 * variance * (at**2 - nu**2))
+    waves = part / part.sum(axis=0) * np.exp(-2j * np.pi * at * c)
+    return waves.sum(axis=0), (-2j * np.pi * at * waves).sum(axis=0)
 
 
 @functools.lru_cache(maxsize=N_OTFS)
