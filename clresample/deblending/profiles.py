@@ -114,10 +114,10 @@ def draw_psf(psf: PSF, position, shape, *, slopes=True):
 
     slopes: with the derivatives; else (1, ny, nx)
 
-    On a frame's pixels waves of nu and nu + m are one. Their parts w_m of P^ are those of a Gaussian
-    G of the PSF's second moment. With that of nu alone, e jumps at Nyquist's frequency, and a star
-    between two pixels has lines of alternating sign along both axes, as far as the frame: at 60 px,
-    20 sigma of a saturated star of Euclid.
+    On a frame's pixels waves of nu and nu + m are one. Their parts w_m of P^ are those of a
+    Gaussian G of the PSF's second moment. With that of nu alone, e jumps at Nyquist's frequency,
+    and a star between two pixels has lines of alternating sign along both axes, as far as the
+    frame: at 60 px, 20 sigma of a saturated star of Euclid.
     """
     extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
     n_fft = max(shape) + 2 * extent + 1
