@@ -103,6 +103,16 @@ def test_a_matrix_that_is_not_positive_definite_is_refused():
         BlockCholesky(matrix)
 
 
+def test_rounding_that_leaves_a_matrix_indefinite_is_no_knowledge():
+    """Of two unknowns that are one to the data, by products with errors of 1e-5."""
+    matrix = BlockMatrix([1, 1])
+    matrix.block(0, 0)[:] = matrix.block(1, 1)[:] = 4.0
+    matrix.block(0, 1)[:] = 4.0 * (1 + 1e-5)
+    found = BlockCholesky(matrix).inverse().dense()
+    assert found.sum() == pytest.approx(1 / 4, rel=1e-3)
+    assert np.sqrt(found.diagonal()).min() > 50 * 0.5  # of errors where the other one is known
+
+
 def test_memory_follows_the_number_of_sources():
     """Twice as many in a field that is as deep take hardly more than twice as much."""
     held = []

@@ -10,8 +10,9 @@ from helpers.blends import blend, gaussian, observe, round_component
 from clresample import Flag, Grid, PointSource, catalogue, deblend, fluxes, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.status import with_misfit_status
-from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, fine_scatter
+from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, _kernels, fine_scatter
 from clresample.sky.observation import masked
+from clresample.sky.psf import PSF
 
 GRID = Grid.flat((80, 84), 0.1)
 PLACES = (30, 28), (48, 55)
@@ -175,3 +176,12 @@ def test_errors_of_a_faint_point_hold_the_light_around_it(sigma_px, kind):
         np.testing.assert_allclose(error, [3.03, 3.63, 3.64], rtol=0.03)
     else:
         assert (np.abs(flux - (20, 14, 18)) < 2 * error).all() and (error > 2 * flux).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_sharp_oversampled_psf_gives_a_kernel_without_a_warning():
+    """As wide as the PSF on the observation's pixels, on which such a PSF could not be given."""
+    (kernel,) = _kernels(PSF.gaussian(0.6, spacing=0.25))
+    assert kernel.sum() == pytest.approx(1)
+    variance = (kernel.sum(axis=0) * (np.arange(41) - 20) ** 2).sum()
+    assert np.sqrt(variance) == pytest.approx(0.66, abs=0.1)  # with the pixel

@@ -25,6 +25,8 @@ MIN_WEIGHT = 1e-6
 # [px] Largest size of several channels' images that are transformed in one call. For blends a call
 # costs as much as its arithmetic; larger images, such as tiles, are transformed one by one.
 TOGETHER_PX = 1 << 17
+# [px] Half side of the Gaussians in place of oversampled PSFs.
+KERNEL_PX = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +184,10 @@ def _kernels(psf):
     """Images of the PSF on the observation's pixels; of an oversampled one, Gaussians as wide."""
     if psf.spacing == 1:
         return psf.images
-    sigma_px = psf.fwhm_px / np.sqrt(8 * np.log(2))
-    return type(psf).gaussian(sigma_px, pixel=False).images
+    sigma_px = psf.fwhm_px[:, None] / np.sqrt(8 * np.log(2))
+    side = np.exp(-0.5 * (np.arange(-KERNEL_PX, KERNEL_PX + 1) / sigma_px) ** 2)
+    side /= side.sum(axis=1, keepdims=True)
+    return side[:, :, None] * side[:, None]
 
 
 def _owners(result, i_observation, positions):
