@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 from ..sky.validation.checks import as_float_array, check_instance
 from .ended import Ended
+from .solver.scene import ComponentStructure
 
 # Limits of one fit. Its spectra are solved together, in time n^3 for n components: 2000 take
 # minutes. Several arrays of components times pixels are in memory at a time. Sources further apart
@@ -32,8 +34,9 @@ class Blend:
         because the profiles of the first came from images that disagreed
     thetas (S): `Result.thetas` of an earlier fit of these sources on a frame of the same pixels,
         None or () for sources that it did not have; their profiles start from them. (): for none
-    structures (S): `Result.structures` of that fit, likewise; structure and strengths start from
-        them where they describe the data better than the profiles alone
+    structures (S): `Result.structures` of that fit, on this frame or one with the same first
+        pixel; structure and strengths start from them where they describe the data better than
+        the profiles alone
     """
 
     observations: tuple[Observation, ...]
@@ -58,6 +61,19 @@ class Blend:
                     f"{name} has {n_entries} entries, must have one for each of {n} sources or "
                     f"none: pass Result.{name} of a fit of the same sources"
                 )
+        if self.structures and not self.thetas:
+            raise ValueError(
+                "structures are given without thetas, about whose profiles they are: pass "
+                "Result.thetas and Result.structures of one fit"
+            )
+        for i, own in enumerate(self.structures):
+            for structure in () if own is None else own:
+                if not (structure is None or _is_structure(structure)):
+                    raise ValueError(
+                        f"structures[{i}] has {reprlib.repr(structure)}, must have None or a "
+                        "ComponentStructure of each component, with as many coefficients (ny, nx) "
+                        "as strengths >= 0, all finite: pass Result.structures"
+                    )
         for i, own in enumerate(self.thetas):
             for theta in () if own is None else own:
                 if np.ndim(theta) != 1 or not np.isfinite(theta).all():
@@ -124,6 +140,16 @@ class Blend:
                     f"the model frame {frame.shape}"
                 )
         return frame
+
+
+def _is_structure(given):
+    """Returns True for a ComponentStructure that a fit can go on from."""
+    return (
+        isinstance(given, ComponentStructure)
+        and len(given.coefficients) == len(given.strengths)
+        and all(np.ndim(z) == 2 and np.isfinite(z).all() for z in given.coefficients)
+        and bool((np.isfinite(given.strengths) & (np.asarray(given.strengths) >= 0)).all())
+    )
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,7 @@ class Fit:
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
+        self._whitened = self.views, tuple(self.messages)
         self.seconds = {"setup": time.perf_counter() - began}
 
     @property
@@ -99,6 +100,10 @@ class Fit:
         known = signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
         return known, self.settings.fit_shifts
 
+    def forget_start(self):
+        """Restores weights and messages as they were before a start, which may have failed."""
+        self.views, self.messages = self._whitened[0], list(self._whitened[1])
+
     def begin(self, point: StartingPoint, seconds):
         """Makes the scene and its state from the starting point; seconds: the time of the start."""
         began = time.perf_counter()
@@ -110,7 +115,7 @@ class Fit:
         self.seconds["setup"] += seconds + time.perf_counter() - began
 
     def go_on_from(self, state):
-        """Replaces the state at the start, here and in `restart`."""
+        """Replaces the state at the start, here and in `restart`; None: that of the profiles."""
         self.state = self._going_on = state
 
     def restart(self):
@@ -195,6 +200,8 @@ class Fit:
 def start_fits(fits):
     """Starts fits of one signature side by side."""
     began = time.perf_counter()
+    for fit in fits:
+        fit.forget_start()
     points = fit_start_profiles([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
@@ -203,7 +210,7 @@ def start_fits(fits):
 
 
 def render_fits(fits) -> list[RenderedModel]:
-    """Renders ended fits of one batch key side by side, as `Fit.result` needs them."""
+    """Renders ended fits of one signature side by side, as `Fit.result` needs them."""
     began = time.perf_counter()
     found = render_models([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
     for fit in fits:

@@ -22,6 +22,9 @@ from ..sky.sources import ExtendedSource, PointSource
 
 # Number of cached OTFs of model PSFs: the stars of a frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
+# [px^2] Least second moment with which `draw_psf` divides a PSF's waves: that of the default PSF of
+# frames. Noise in the wings of a frame's own PSF may leave a smaller one, or a negative one.
+MIN_MOMENT = 0.64
 # Prior on a galaxy (start/population.py updates it from the scene's other galaxies): Gaussian sigma
 # 0.25" (half-light radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; round,
 # with a scatter of 0.17 per component; wings between exponential and Gaussian, nearer to the
@@ -122,7 +125,8 @@ def draw_psf(psf: PSF, position, shape, *, slopes=True):
     extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
     n_fft = max(shape) + 2 * extent + 1
     n_fft += 1 - n_fft % 2
-    nu, variance = np.fft.fftfreq(n_fft), np.diag(psf_second_moment(psf))
+    nu, moment = np.fft.fftfreq(n_fft), np.diag(psf_second_moment(psf))
+    variance = np.maximum(moment, MIN_MOMENT)
     (along_y, slope_y), (along_x, slope_x) = (
         _shift(nu, *pair) for pair in zip(position, variance, strict=True)
     )

@@ -103,14 +103,27 @@ def test_a_matrix_that_is_not_positive_definite_is_refused():
         BlockCholesky(matrix)
 
 
-def test_rounding_that_leaves_a_matrix_indefinite_is_no_knowledge():
-    """Of two unknowns that are one to the data, by products with errors of 1e-5."""
+def nearly_one(error):
+    """A BlockMatrix of two unknowns that are one to the data, by products with an error."""
     matrix = BlockMatrix([1, 1])
     matrix.block(0, 0)[:] = matrix.block(1, 1)[:] = 4.0
-    matrix.block(0, 1)[:] = 4.0 * (1 + 1e-5)
-    found = BlockCholesky(matrix).inverse().dense()
+    matrix.block(0, 1)[:] = 4.0 * (1 + error)
+    return matrix
+
+
+@pytest.mark.parametrize("error", [3e-7, 0.999e-6, 1e-6, 3.999e-6, 1e-5, 2e-4])
+def test_rounding_that_leaves_a_matrix_indefinite_is_no_knowledge(error):
+    """Nor is it by chance nearly infinite ignorance, where a ridge all but equals the error."""
+    found = BlockCholesky(nearly_one(error)).inverse().dense()
     assert found.sum() == pytest.approx(1 / 4, rel=1e-3)
-    assert np.sqrt(found.diagonal()).min() > 50 * 0.5  # of errors where the other one is known
+    errors = np.sqrt(found.diagonal())
+    assert errors.min() > 20 * 0.5  # of those where the other one is known
+    assert errors.max() < np.sqrt(1 / (2 * 4 * max(error, 1e-6))) * 1.01
+
+
+def test_a_matrix_that_is_indefinite_by_more_than_rounding_is_refused():
+    with pytest.raises(np.linalg.LinAlgError, match="by more than rounding"):
+        BlockCholesky(nearly_one(2e-3))
 
 
 def test_memory_follows_the_number_of_sources():

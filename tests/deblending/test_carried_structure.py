@@ -10,6 +10,8 @@ from helpers.scenes import blend
 from clresample import Settings
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Failure
+from clresample.deblending.fit import Fit, start_fits
+from clresample.deblending.iterate import iterate
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.deblending.solver.multiscale.structure import coarse_count
 from clresample.deblending.solver.scene import ComponentStructure
@@ -75,6 +77,19 @@ def test_a_fit_goes_on_where_another_ended(ended, device):
     assert again.losses[-1] < first.losses[-1] + 0.1
 
 
+def test_a_fit_that_starts_again_does_so_from_the_structure(ended, device):
+    scene, first = ended
+    scene = replace(scene, thetas=first.thetas, structures=first.structures)
+    (fit,) = fits = [Fit(scene, Settings(max_iter=3), device, np.float32, pad=1)]
+    start_fits(fits)
+    losses = []
+    for _ in range(2):
+        fit.restart()
+        iterate(fits, fit.settings, device, np.float32)
+        losses.append(fit.losses[0])
+    assert losses[0] == losses[1] == pytest.approx(first.losses[-1], rel=0.01)
+
+
 def test_structure_of_another_galaxy_is_not_taken(ended, device):
     """The fit begins with profiles alone if they describe the data better."""
     scene, first = ended
@@ -91,8 +106,34 @@ def test_structure_of_another_prior_is_refused(ended, device):
     given = {"thetas": first.thetas, "structures": first.structures}
     prior = MultiscalePrior(scales_px=(0.8,), strengths=(0.1,))
     settings = Settings(prior=prior, max_iter=1, errors=False)
-    failed, other = deblend_many([replace(scene, **given), scene], settings=settings, device=device)
+    star = blend([((22.0, 24.0), (90000, 80000, 70000), 0.0)], shape=(48, 48), seed=3)
+    run = {"settings": settings, "device": device}
+    failed, beside = deblend_many([replace(scene, **given), star], **run)
     assert isinstance(failed, Failure) and "3 scales, the prior has 1" in failed.reason
-    assert not isinstance(other, Failure)
-    with pytest.raises(ValueError, match="structures has 1 entries, must have one for each of 2"):
-        replace(scene, structures=first.structures[:1]).check()
+    (alone,) = deblend_many([star], **run)  # its weights hold the PSF's error once, not twice
+    assert beside.losses[0] == pytest.approx(alone.losses[0], rel=1e-5)
+    assert beside.messages == alone.messages
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        (lambda own: {"structures": own}, "structures are given without thetas"),
+        (lambda own: {"structures": own[:1]}, "structures has 1 entries, must have one for each"),
+        (
+            lambda own: {"thetas": ((), ()), "structures": ((3,), ())},
+            r"structures\[0\] has 3, must",
+        ),
+        (
+            lambda own: {
+                "thetas": ((), ()),
+                "structures": ((replace(own[0][0], strengths=np.ones(1)),), ()),
+            },
+            r"structures\[0\] has .* as many coefficients",
+        ),
+    ],
+)
+def test_structures_that_no_fit_can_go_on_from_are_refused(ended, given, message):
+    scene, first = ended
+    with pytest.raises(ValueError, match=message):
+        replace(scene, **given(first.structures)).check()

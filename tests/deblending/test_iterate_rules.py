@@ -24,7 +24,7 @@ def no_joint_step(monkeypatch):
 
 
 def test_joint_steps_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
-    """Of settled fits after FIRST_JOINT_STEP rounds and each EXCHANGE.
+    """Of settled fits after FIRST_JOINT_STEP rounds and each JOINT_STEP_ITERATIONS.
 
     Of converged ones at once.
     """

@@ -56,7 +56,7 @@ def posed(bright=10.0):
 
 
 def joint_step_at(one, scale=(1.0, 1.0, 1.0), *, fit_sky=True):
-    """The Exchange of a Solution under weights of a sharp noise, each channel's times scale^2."""
+    """The JointNewtonStep of a Solution under weights of a sharp noise, channels times scale^2."""
     rng = np.random.default_rng(1)
     root = 30 * rng.uniform(0.5, 2, (3, *SHAPE)) * np.array(scale)[:, None, None]
     shared = [one.overlap_mask(i) for i in range(len(BOXES))]

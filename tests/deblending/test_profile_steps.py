@@ -105,6 +105,7 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
     n_trials = looking.n_looks - before
     assert n_trials[0] < n_trials[1] and again == [0, 1, 2]
     assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, 0]
+    assert fit.is_known.tolist() == [True, False, False]
 
 
 def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):

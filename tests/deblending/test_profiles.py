@@ -54,6 +54,17 @@ def test_a_star_is_the_psf():
     assert np.abs(corner[20:, 20:]).max() < 1e-12
 
 
+@pytest.mark.parametrize("moment", [-2.0, 0.0, 0.25])
+def test_a_star_has_all_its_light_whatever_noise_does_to_the_moment_of_its_psf(moment):
+    """Of a measured PSF, whose wings may be negative."""
+    image, (y, x) = STAR.images[0].copy(), np.indices(STAR.images[0].shape) - 9
+    wings = np.maximum(y**2, x**2) == 81
+    image[wings] += (moment - 0.64) / (y**2 * wings).sum()
+    psf = PSF(image / image.sum())
+    assert psf_second_moment(psf)[0, 0] < 0.5
+    assert draw_psf(psf, (20.4, 22.3), SHAPE)[0].sum() == pytest.approx(1, abs=2e-3)
+
+
 @pytest.mark.parametrize("center", [(20.0, 22.2), (20.5, 22.3)])
 def test_a_star_between_pixels_has_no_lines_along_the_axes(center):
     """It is the Gaussian of the PSF on pixels, which has no light at 12 px."""

@@ -182,18 +182,24 @@ def cut(done, sky, tmp_path_factory):
     it was a later round's, and the numbers of components and profiles that it was given."""
     largest = int(table(done[0])["n_blend_sources"].max())
     options, folder = FieldOptions(limits=FitLimits(max_sources=largest - 1)), tmp_path_factory
-    folder, given, with_profiles = folder.mktemp("cut"), [], fitting.with_profiles
+    folder, given, carried = folder.mktemp("cut"), [], []
+    with_profiles = fitting.with_profiles
 
     def noted(blend, profiles, structures, *, single):
         blend = with_profiles(blend, profiles, structures, single=single)
         counts = [s.n_components for s in blend.sources]
         given.append((bool(profiles), counts, [len(own) for own in blend.thetas]))
-        assert bool(profiles) == bool(structures)
+        for source, own in zip(blend.sources, blend.structures, strict=bool(blend.structures)):
+            for one in (one for one in own if one is not None):
+                carried.append(one)
+                size = np.array(one.coefficients[0].shape)  # in the frame of this piece
+                assert (np.abs(np.array(source.position_px) - one.origin - size / 2) < size).all()
         return blend
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "with_profiles", noted)
         run_field(mosaics_of(sky), folder, options=options)
+    assert len(carried) > 1
     return folder, given
 
 

@@ -64,6 +64,7 @@ def start_refits(fits):
 def _again(fit, point):
     """A fit of the same views, at their present shifts, from another StartingPoint."""
     new = copy(fit)
+    new.go_on_from(None)
     new.start = point
     new.scene, new.state = first_scene(new)
     new.losses, new.status, new.strength_estimates = [], Ended.LIMIT, None

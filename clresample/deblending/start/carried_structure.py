@@ -12,6 +12,7 @@ from ..solver.multiscale.prior import MultiscalePrior, kernel_rows
 from ..solver.multiscale.structure import coarse_count
 from ..solver.scene import StructureState
 from .final_render import best_starts
+from .profile_start import by_size
 
 
 def carry_structure(fits):
@@ -47,8 +48,7 @@ def _of_components(fit):
         given, thetas = fit.blend.structures[at] or (), fit.blend.thetas[at] or ()
         if not len(places) == len(given) == len(thetas):
             continue
-        order = sorted(range(len(given)), key=lambda k: tuple(thetas[k][:1]))
-        for k, one in zip(places.tolist(), (given[j] for j in order), strict=True):
+        for k, one in zip(places.tolist(), (given[j] for j in by_size(thetas)), strict=True):
             if one is not None and not fit.scene.fixed[k]:
                 if len(one.coefficients) != n_scales:
                     raise ValueError(
@@ -70,7 +70,7 @@ def _with_structure(fit, known):
             morph = morphology(profile, structure[-1], prior)
             strengths[k], clear[k] = known[k].strengths, known[k].clear
         else:
-            structure.append(None)
+            structure.append([np.zeros(coarse_count(profile.shape, step)) for step in prior.steps])
         morphs.append(morph)
     return replace(fit.state, morph=morphs, learned=StructureState(structure, strengths, clear))
 

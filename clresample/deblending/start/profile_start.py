@@ -208,6 +208,11 @@ def _components(patches):
     return np.array(sources), components
 
 
+def by_size(thetas):
+    """Numbers of a source's components of parameters `thetas` (n), the most compact one first."""
+    return sorted(range(len(thetas)), key=lambda k: tuple(thetas[k][:1]))
+
+
 def _known(patches, components):
     """Parameters {component: (n,)} of `StartInput.thetas`, of sources with as many components.
 
@@ -218,7 +223,7 @@ def _known(patches, components):
     for (b, i), own in groupby(numbers, lambda k: (components[k].scene, components[k].source)):
         given = patches[b].thetas[i] if len(patches[b].thetas) else None
         places, before = list(own), () if given is None else list(given)
-        before = sorted(before, key=lambda theta: theta[0]) if len(before) > 1 else before
+        before = [before[k] for k in by_size(before)]
         sizes = [len(components[k].shape.mean) for k in places]
         if [len(theta) for theta in before] == sizes:
             known |= dict(zip(places, before, strict=True))

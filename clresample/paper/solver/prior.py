@@ -24,7 +24,7 @@ class SingleScalePrior:
     correlation_px: float = 2.0
 
     def amplitude(self, profile) -> np.ndarray:
-        """Scatter of a profile's pixels: alpha sqrt(p); 0 where a star's rings are negative."""
+        """Scatter of a profile's pixels: alpha sqrt(p); 0 where a star's wings are negative."""
         return self.strength * np.sqrt(np.maximum(profile, 0))
 
     @property

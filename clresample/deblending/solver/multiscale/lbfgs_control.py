@@ -47,11 +47,11 @@ FIRST_EXCHANGE_ROUND = 40
 # flux errors grow as its square root. The remainder is MAX_REMAINDER while light of neighbours may
 # still move: of four fits of giants with a small galaxy that were continued for 500 rounds, the
 # largest fluxes' changes were 1.0, 0.4, 0.2 and 0.2 errors with 1 in its place, and all below 0.02
-# with 0.1. LATE_ROUNDS after exchange directions are first sought, without a rejected step, what
-# still falls is fine structure, and LATE_REMAINDER is enough, of a series of falls over windows of
-# twice as many iterations: changes of nine giants' and pairs' fluxes stay below 0.06 errors, in
-# three quarters of the iterations (bench.ladder, seeds 505 and 6161). With 4 they take two thirds,
-# but a fit of HST and HSC ends on a plateau, from which one flux moves by 0.9 errors.
+# with 0.1. LATE_ROUNDS after exchange directions are first sought, without a rejected step of its
+# own, what still falls is fine structure, and LATE_REMAINDER is enough, of a series of falls over
+# windows of twice as many iterations: changes of nine giants' and pairs' fluxes stay below 0.06
+# errors, in three quarters of the iterations (bench.ladder, seeds 505 and 6161). With 4 they take
+# two thirds, but a fit of HST and HSC ends on a plateau, from which one flux moves by 0.9 errors.
 CONVERGENCE_WINDOW, MAX_REMAINDER, MIN_FALL = 5, 0.1, 0.01
 LATE_ROUNDS, LATE_REMAINDER = 2 * CONVERGENCE_WINDOW, 1.0
 
