@@ -9,7 +9,7 @@
  * apply_block_inverse  H y and H P g_new by blocks, which share no variable; written over the old
  *           values or, with `more`, added to them; launch: (WG, n blocks), groups of (WG, 1)
  *
- * Directions d of few variables add d d^T to these inverses, the terms of a variable in their order.
+ * Directions d of few variables add d d^T to these inverses, a variable's terms in their order.
  *   owner     (m,) int: the scene of each direction;  totals (m, 2): d . y and d . P g_new
  * direction_products  totals, 0 of idle scenes; ends (m + 1,) int: first of each direction's
  *           elements, then the number of all;  places (k,) int and d (k,): the elements' variables

@@ -145,7 +145,7 @@ def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch
         return [starts[0][which]]
 
     monkeypatch.setattr(two_component_start, "run_gradient_tests", asked)
-    monkeypatch.setattr(two_component_start, "_best", chosen)
+    monkeypatch.setattr(two_component_start, "best_starts", chosen)
     monkeypatch.setattr(two_component_fit, "iterate", lambda *given: None)
     deblend(b.observations, b.sources, frame=b.frame, device=device)
     (first,), new = pairs[0], pairs[1][which]

@@ -181,7 +181,7 @@ def test_exposures_may_be_channels_of_one_observation(images):
     other = deblend([*exposures(images[0]), red(images)], SOURCES)
     flux, error = measured(other)
     np.testing.assert_allclose((measured(one)[0] - flux) / error, 0, atol=4e-2)
-    np.testing.assert_allclose(measured(one)[1], error, rtol=5e-3)
+    np.testing.assert_allclose(measured(one)[1], error, rtol=2e-2)
 
 
 def test_errors_are_those_of_the_dense_matrix_summed_over_channels(images):
@@ -251,7 +251,7 @@ def test_an_exposure_without_weight_changes_nothing(images):
     other = deblend([*exposures(images[0]), dead, red(images)], SOURCES)
     flux, error = measured(one)
     np.testing.assert_allclose((measured(other)[0] - flux) / error, 0, atol=4e-2)
-    np.testing.assert_allclose(measured(other)[1], error, rtol=1e-2)
+    np.testing.assert_allclose(measured(other)[1], error, rtol=2e-2)
 
 
 @pytest.mark.parametrize("prior", [None, "one scale"])
