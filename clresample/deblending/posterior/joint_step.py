@@ -9,6 +9,8 @@ The matrix ignores the bound S >= 0. Many wing pixels lie on that bound, and a s
 raises the loss. Three in four of the full steps are rejected on simulated scenes (133 of 180 in 120
 scenes), nearly all in a bright blend of HSC, and a shortened step gains. Without any such step, a
 fit of HST and HSC to a merger had a loss 50 higher after 500 iterations than with them after 250.
+Steps that count what each pixel adds beyond its bound gain most of what they promise, and fits then
+take 5 % fewer iterations, but as many core-seconds (72 scenes of bench.throughput).
 """
 
 from __future__ import annotations
