@@ -115,9 +115,7 @@ def with_star_psfs(image, sources, places, sky):
                 is_wide or isinstance(sources[i], PointSource)
             ):
                 grow = WIDE_GROW_PX if is_wide else GROW_PX
-                wide[c] |= image.usable[c] & binary_dilation(
-                    core.masked, np.ones((3, 3), bool), grow
-                )
+                wide[c] |= image.usable[c] & core.grown(image.significance[c], image.usable[c], grow)
                 if is_wide:
                     found.setdefault(i, {})[c] = core
     image = image.without(wide) if wide.any() else image
