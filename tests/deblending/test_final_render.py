@@ -125,8 +125,12 @@ def test_weights_hold_the_psfs_error_in_all_stars(device):
         for one in stars:
             light, change = wrong_light(one, old, one[3][part])
             error = error + light**2 + change**2
-        wanted = 1 / np.sqrt(1 / np.maximum(old.sqrt_weights, 1e-30) ** 2 + 0.02**2 * error)
-        np.testing.assert_allclose(new.sqrt_weights, wanted * (old.sqrt_weights > 0), rtol=1e-3)
+        seen = old.sqrt_weights > 0
+        assert (new.sqrt_weights[~seen] == 0).all()
+        added = np.maximum(new.sqrt_weights[seen] ** -2.0 - old.sqrt_weights[seen] ** -2.0, 0)
+        wanted = 0.02 * np.sqrt(error[seen])
+        # boxes have an operator of their own, whose error is a part of the brightest pixel
+        np.testing.assert_allclose(np.sqrt(added), wanted, rtol=1e-3, atol=3e-3 * wanted.max())
         assert (new.sqrt_weights < 0.5 * old.sqrt_weights).any()
         assert new.data is old.data
 
