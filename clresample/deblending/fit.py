@@ -91,9 +91,7 @@ class Fit:
         thetas = self.blend.thetas if len(self.blend.thetas) else [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
         positions, observations = self._positions[i], self.blend.observations
-        return StartInput(
-            self.frame, sources, positions, self.views, tuple(thetas), observations
-        )
+        return StartInput(self.frame, sources, positions, self.views, tuple(thetas), observations)
 
     @property
     def signature(self):

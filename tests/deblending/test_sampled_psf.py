@@ -36,9 +36,7 @@ def exact(place):
 
 def observation(psf=None, grid=GRID):
     psf = pixel_psf() if psf is None else psf
-    return Observation(
-        np.zeros(grid.shape), psf, grid, weights=1.0, channels=("r",), name="cam"
-    )
+    return Observation(np.zeros(grid.shape), psf, grid, weights=1.0, channels=("r",), name="cam")
 
 
 @pytest.mark.parametrize("place", PLACES)
