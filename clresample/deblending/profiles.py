@@ -39,8 +39,9 @@ COMPONENT_SPREAD = 1.0
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 # Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
-# tenth of a pixel's noise.
-ALIAS_THRESHOLDS = 10.0
+# tenth of a pixel's noise, and to this distance [px]: they reach far along both axes, and boxes that
+# cut those of a saturated star at 33 px left rows of false sources beyond.
+ALIAS_THRESHOLDS, MAX_ALIAS_PX = 10.0, 128
 
 
 def covariance(parameters, psf_moment):
@@ -286,7 +287,7 @@ class StarProfile(ComponentProfile):
     @functools.cached_property
     def _tails(self):
         """Largest light (n,) [peak] of the star on each square of pixels about it."""
-        n = reach_px(self.sampled)
+        n = MAX_ALIAS_PX
         middle, shape = (n, n), (2 * n + 1, 2 * n + 1)
         image = draw_psf(self.psf, middle, shape, slopes=False, sampled=self.sampled)[0]
         away = np.abs(np.indices(shape) - n).max(axis=0)

@@ -1,4 +1,4 @@
-"""PSFs of the observations on whose pixels the model's frame lies, and the waves that they alias.
+"""PSFs sampled on the model's own pixels, and the waves that these alias.
 
 A space telescope's PSF has waves shorter than two of its pixels. Its pixels show them as longer
 waves, whose phases follow from the star's position. The model's PSF is smooth and has nearly none.
@@ -19,7 +19,7 @@ from .inspection.star_psfs import StarPSFs
 MAX_OFFSET_PX = 0.02
 # [1] Transfer below which a PSF's waves are noise, and those of the model's PSF replace them.
 MIN_TRANSFER = 1e-3
-# [px] Largest distance from a star at which aliased waves are drawn.
+# [px] Largest distance from a star at which its PSF's samples count.
 MAX_REACH_PX = 64
 # Number of cached tables of `alias_tables`, of about 3 MB each.
 N_TABLES = 8
