@@ -39,9 +39,11 @@ COMPONENT_SPREAD = 1.0
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 # Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
-# tenth of a pixel's noise, and to this distance [px]: they reach far along both axes, and boxes that
-# cut those of a saturated star at 33 px left rows of false sources beyond.
-ALIAS_THRESHOLDS, MAX_ALIAS_PX = 10.0, 128
+# tenth of a pixel's noise.
+ALIAS_THRESHOLDS = 10.0
+# [px] Distances to which they are searched, the second for stars bright enough: they reach far
+# along both axes, and boxes that cut those of a saturated star at 33 px left rows of false sources.
+ALIAS_PX = 12, 128
 
 
 def covariance(parameters, psf_moment):
@@ -263,6 +265,7 @@ class StarProfile(ComponentProfile):
         self.shape, self.psf, self.free, self.sampled = frame.shape, frame.psf, free, sampled
         self.mean = np.zeros(2 if free else 0)
         self.scatter = np.full(len(self.mean), STAR_SCATTER_PX)
+        self._tails: dict[int, np.ndarray] = {}
 
     def draw(self, theta, position, shape=None):
         """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
@@ -279,19 +282,22 @@ class StarProfile(ComponentProfile):
     def bounding_box(self, theta, position, threshold):
         """Its image, and the aliased waves around it that are above a multiple of the threshold."""
         half = max(self.psf.images.shape[1:]) * self.psf.spacing / 2
-        if self.sampled:
-            faint = np.flatnonzero(self._tails > ALIAS_THRESHOLDS * threshold)
-            half = max(half, faint[-1] if len(faint) else 0)
-        return self.center(theta, position), np.full(2, half + 1)
+        end = half
+        for n in ALIAS_PX if self.sampled else ():
+            end = np.flatnonzero(self._tail(n) > ALIAS_THRESHOLDS * threshold).max(initial=0)
+            if end < n:
+                break
+        return self.center(theta, position), np.full(2, max(half, end) + 1)
 
-    @functools.cached_property
-    def _tails(self):
-        """Largest light (n,) [peak] of the star on each square of pixels about it."""
-        n = MAX_ALIAS_PX
-        middle, shape = (n, n), (2 * n + 1, 2 * n + 1)
-        image = draw_psf(self.psf, middle, shape, slopes=False, sampled=self.sampled)[0]
-        away = np.abs(np.indices(shape) - n).max(axis=0)
-        return ndimage.maximum(np.abs(image), away, np.arange(n + 1)) / image.max()
+    def _tail(self, n):
+        """Largest light (n + 1,) [peak] of the star on each square of pixels about it, kept."""
+        if n not in self._tails:
+            shape = (2 * n + 1, 2 * n + 1)
+            image = draw_psf(self.psf, (n, n), shape, slopes=False, sampled=self.sampled)[0]
+            away = np.abs(np.indices(shape) - n).max(axis=0)
+            light = ndimage.maximum(np.abs(image), away, np.arange(n + 1))
+            self._tails[n] = light / image.max()
+        return self._tails[n]
 
     def center(self, theta, position):
         """Position of the component (2,) [px]."""

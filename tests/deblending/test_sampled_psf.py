@@ -5,7 +5,7 @@ import pytest
 from scipy.special import erf
 
 from clresample.deblending.inspection.star_psfs import StarPSFs
-from clresample.deblending.profiles import MAX_ALIAS_PX, StarProfile, draw_psf
+from clresample.deblending.profiles import ALIAS_PX, StarProfile, draw_psf
 from clresample.deblending.sampled_psf import MAX_REACH_PX, reach_px, sampled_psfs
 from clresample.resampling.resampler import Resampler
 from clresample.sky.frame import Frame, model_psf
@@ -73,7 +73,7 @@ def test_boxes_hold_the_waves_of_bright_stars():
     place = np.array([20.0, 22.0])
     reach = [star.bounding_box(np.zeros(2), place, t)[1][0] for t in (1e-2, 1e-5, 1e-7)]
     assert reach[0] == plain.bounding_box(np.zeros(2), place, 1e-7)[1][0]
-    assert reach[0] < reach[1] < reach[2] <= MAX_ALIAS_PX + 1
+    assert reach[0] < reach[1] < reach[2] <= ALIAS_PX[1] + 1
     assert reach_px([pixel_psf()]) == 11
     assert reach_px([PSF.gaussian(3.0, n_pixels=2 * MAX_REACH_PX + 9)]) == MAX_REACH_PX
 
