@@ -91,7 +91,8 @@ class Fit:
         i = self.fitted
         thetas = self.blend.thetas if len(self.blend.thetas) else [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
-        return StartInput(self.frame, sources, self._positions[i], self.views, tuple(thetas))
+        positions, observations = self._positions[i], self.blend.observations
+        return StartInput(self.frame, sources, positions, self.views, tuple(thetas), observations)
 
     @property
     def signature(self):

@@ -15,10 +15,12 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy import ndimage
 
 from ..sky.box import box_slices
 from ..sky.psf import PSF
 from ..sky.sources import ExtendedSource, PointSource
+from .sampled_psf import alias_tables, reach_px
 
 # Number of cached OTFs of model PSFs: the stars of a frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
@@ -39,6 +41,12 @@ WINGS, WINGS_SCATTER = 6.5, 0.7
 COMPONENT_SPREAD = 1.0
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
+# Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
+# tenth of a pixel's noise.
+ALIAS_THRESHOLDS = 10.0
+# [px] Distances to which they are searched, the second for stars bright enough: they reach far
+# along both axes, and boxes that cut those of a saturated star at 33 px left rows of false sources.
+ALIAS_PX = 12, 128
 
 
 def covariance(parameters, psf_moment):
@@ -109,45 +117,56 @@ def psf_second_moment(psf: PSF) -> np.ndarray:
     return np.array([[yy, yx], [yx, xx]])
 
 
-def draw_psf(psf: PSF, position, shape, *, slopes=True):
+def draw_psf(psf: PSF, position, shape, *, slopes=True, sampled=()):
     """The PSF at a sub-pixel position and its derivatives by (y, x) (3, ny, nx), unit integral.
 
-        S(x) = K^-2 sum_nu P^(nu) e(nu_y, c_y) e(nu_x, c_x) exp(2 pi i nu.x),    K > n + its extent
-        e(nu, c) = sum_m w_m exp(-2 pi i (nu + m) c),    w_m ~ G^(nu + m),    m = -1, 0, 1
+        S(x) = K^-2 sum_nu P^(nu) e(nu, c) exp(2 pi i nu.x),         K > n + its extent
+        e(nu, c) = sum_m w_m(nu) exp(-2 pi i (nu + m).c),    m = -1, 0, 1 along y and x
 
     slopes: with the derivatives; else (1, ny, nx)
+    sampled: PSFs of the observations on whose pixels the image lies, see `sampled_psfs`
 
-    On a frame's pixels waves of nu and nu + m are one. Their parts w_m of P^ are those of a
-    Gaussian G of the PSF's second moment. With that of nu alone, e jumps at Nyquist's frequency,
-    and a star between two pixels has lines of alternating sign along both axes, as far as the
-    frame: at 60 px, 20 sigma of a saturated star of Euclid.
+    On a frame's pixels waves of nu and nu + m are one. Their parts w_m are those of `sampled`, so
+    that the star is exact in these observations. Without any they are those of a Gaussian G of the
+    PSF's second moment, w_m ~ G^(nu + m). With the wave of nu alone, e jumps at Nyquist's
+    frequency, and a star between two pixels has lines of alternating sign along both axes, as far
+    as the frame: at 60 px, 20 sigma of a saturated star of Euclid.
     """
-    extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
+    extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing)) + reach_px(sampled)
     n_fft = max(shape) + 2 * extent + 1
     n_fft += 1 - n_fft % 2
-    nu, moment = np.fft.fftfreq(n_fft), np.diag(psf_second_moment(psf))
-    variance = np.maximum(moment, MIN_MOMENT)
-    (along_y, slope_y), (along_x, slope_x) = (
-        _shift(nu, *pair) for pair in zip(position, variance, strict=True)
-    )
-    parts = [(along_y, along_x), (slope_y, along_x), (along_y, slope_x)]
-    transforms = [_otf(psf, n_fft) * y[:, None] * x for y, x in parts[: 3 if slopes else 1]]
-    return np.fft.ifft2(transforms).real[:, : shape[0], : shape[1]].copy()
+    nu_y, nu_x = np.fft.fftfreq(n_fft), np.fft.rfftfreq(n_fft)
+    moments = np.maximum(np.diag(psf_second_moment(psf)), MIN_MOMENT)
+    pairs = zip((nu_y, nu_x), position, moments, strict=True)
+    (along_y, slope_y), (along_x, slope_x) = (_shift(*one) for one in pairs)
+    chosen = [(along_y, along_x), (slope_y, along_x), (along_y, slope_x)][: 3 if slopes else 1]
+    waves = np.array([y[0][:, None] * x[0] for y, x in chosen])
+    if sampled:
+        tables, rest = alias_tables(sampled, n_fft)
+        waves *= rest
+        for wave, (y, x) in zip(waves, chosen, strict=True):
+            for m, n in np.ndindex(3, 3):
+                wave += tables[m, n] * (y[1][m][:, None] * x[1][n])
+    images = np.fft.irfft2(_otf(psf, n_fft) * waves, s=(n_fft, n_fft))
+    return images[:, : shape[0], : shape[1]].copy()
 
 
 def _shift(nu, c, variance):
-    """e (K,) of `draw_psf` and its derivative by c; variance [px^2]: of the PSF along this axis."""
+    """Waves of `draw_psf` along an axis, and their derivatives by c.
+
+    Each is a pair, (K,) with the parts of the Gaussian and (3, K) of all m; variance [px^2]: of
+    the PSF along this axis
+    """
     at = nu + np.array([-1, 0, 1])[:, None]
     part = np.exp(-2 * np.pi**2 * variance * (at**2 - nu**2))
-    waves = part / part.sum(axis=0) * np.exp(-2j * np.pi * at * c)
-    return waves.sum(axis=0), (-2j * np.pi * at * waves).sum(axis=0)
+    waves, part = np.exp(-2j * np.pi * at * c), part / part.sum(axis=0)
+    return tuple(((part * w).sum(axis=0), w) for w in (waves, -2j * np.pi * at * waves))
 
 
 @functools.lru_cache(maxsize=N_OTFS)
 def _otf(psf, n_fft):
-    """P^ of the first band (n_fft, n_fft) in the order of the FFT."""
-    nu = np.fft.fftfreq(n_fft)
-    return psf.otf(nu, nu)[0]
+    """P^ of the first band (n_fft, n_fft // 2 + 1) in the order of a real FFT."""
+    return psf.otf(np.fft.fftfreq(n_fft), np.fft.rfftfreq(n_fft))[0]
 
 
 class ComponentProfile:
@@ -241,17 +260,23 @@ class FixedProfile(ComponentProfile):
 
 
 class StarProfile(ComponentProfile):
-    """The model's PSF; theta (2,) [px]: its offset from the listed position, if free."""
+    """The model's PSF; theta (2,) [px]: its offset from the listed position, if free.
 
-    def __init__(self, frame, *, free):
-        self.shape, self.psf, self.free = frame.shape, frame.psf, free
+    sampled: PSFs of the observations on whose pixels the frame lies, see `sampled_psfs`
+    """
+
+    def __init__(self, frame, *, free, sampled=()):
+        self.shape, self.psf, self.free, self.sampled = frame.shape, frame.psf, free, sampled
         self.mean = np.zeros(2 if free else 0)
         self.scatter = np.full(len(self.mean), STAR_SCATTER_PX)
+        self._tails: dict[int, np.ndarray] = {}
 
     def draw(self, theta, position, shape=None):
         """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
-        shape = shape or self.shape
-        return draw_psf(self.psf, self.center(theta, position), shape, slopes=self.free)
+        center = self.center(theta, position)
+        return draw_psf(
+            self.psf, center, shape or self.shape, slopes=self.free, sampled=self.sampled
+        )
 
     @property
     def peak(self) -> float:
@@ -259,19 +284,34 @@ class StarProfile(ComponentProfile):
         return float(self.psf.images[0].max())
 
     def bounding_box(self, theta, position, threshold):
-        """Its image."""
+        """Its image, and the aliased waves around it that are above a multiple of the threshold."""
         half = max(self.psf.images.shape[1:]) * self.psf.spacing / 2
-        return self.center(theta, position), np.full(2, half + 1)
+        end = half
+        for n in ALIAS_PX if self.sampled else ():
+            end = np.flatnonzero(self._tail(n) > ALIAS_THRESHOLDS * threshold).max(initial=0)
+            if end < n:
+                break
+        return self.center(theta, position), np.full(2, max(half, end) + 1)
+
+    def _tail(self, n):
+        """Largest light (n + 1,) [peak] of the star on each square of pixels about it, kept."""
+        if n not in self._tails:
+            shape = (2 * n + 1, 2 * n + 1)
+            image = draw_psf(self.psf, (n, n), shape, slopes=False, sampled=self.sampled)[0]
+            away = np.abs(np.indices(shape) - n).max(axis=0)
+            light = ndimage.maximum(np.abs(image), away, np.arange(n + 1))
+            self._tails[n] = light / image.max()
+        return self._tails[n]
 
     def center(self, theta, position):
         """Position of the component (2,) [px]."""
         return position + theta if self.free else position
 
 
-def components_of(source, frame):
-    """The components of a Source, at least one."""
+def components_of(source, frame, sampled=()):
+    """The components of a Source, at least one; sampled: see StarProfile."""
     if isinstance(source, PointSource):
-        return [StarProfile(frame, free=source.free_position)]
+        return [StarProfile(frame, free=source.free_position, sampled=sampled)]
     if isinstance(source, ExtendedSource) and source.profile is not None:
         return [FixedProfile(source.profile)]
     n = (source.n_components if isinstance(source, ExtendedSource) else None) or 1

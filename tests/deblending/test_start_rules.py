@@ -129,8 +129,7 @@ PATCH = np.arange(12.0).reshape(3, 4)
 @pytest.mark.parametrize(
     "kind, theta, threshold, middle, half",
     [
-        # a star: its image and a pixel
-        (star, [0.5, -0.25], 2e-5, (3.5, 3.75), (HALF, HALF)),
+        (star, [0.5, -0.25], 2e-5, (3.5, 3.75), (HALF, HALF)),  # its image and a pixel
         (fixed, [], 1 / 16, (8, 7.5), (4, 2.5)),  # to the faintest pixel above the threshold
         (lambda: _ImageProfile(PATCH, (5, 7), (160, 160)), [], None, (79.5, 79.5), (160, 160)),
         (lambda: _ImageProfile(PATCH, (5, 7), (161, 160)), [], None, (6, 8.5), (1.5, 2)),

@@ -8,7 +8,7 @@ from scipy.ndimage import binary_dilation
 from scipy.signal import fftconvolve
 
 from clresample.deblending.batch import deblend
-from clresample.deblending.inspection.star_cores import star_cores
+from clresample.deblending.inspection.star_cores import StarCore, star_cores
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.detection import detect
 from clresample.measurement.quality import summary
@@ -79,6 +79,15 @@ def test_a_masked_core_is_found_by_the_light_around_it():
     assert np.hypot(*(core.place - STAR)) < 0.5
     assert 2 < core.radius < 8
     assert core.masked[44, 47] and core.masked[:, 47].sum() > 20  # with its bleeds
+
+
+@pytest.mark.parametrize("bright_px, grown_px", [(9.0, 3), (4.0, 1), (2.0, 0)])
+def test_a_core_grows_while_its_star_is_bright_beside_it(bright_px, grown_px):
+    y, x = np.indices((31, 31)) - 15
+    masked, light = (np.maximum(abs(y), abs(x)) < n for n in (3, 3 + bright_px - 2))
+    core = StarCore(np.array([15.0, 15.0]), 3.0, 1e3, masked)
+    grown = core.grown(np.where(light, 1e3, 5.0), ~masked, 3)
+    np.testing.assert_array_equal(grown, np.maximum(abs(y), abs(x)) < 3 + grown_px)
 
 
 def test_bad_columns_and_masked_galaxies_are_no_stars():

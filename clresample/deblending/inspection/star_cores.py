@@ -52,6 +52,20 @@ class StarCore:
     light: float
     masked: np.ndarray
 
+    def grown(self, significance, usable, margin):
+        """The masked pixels (My, Mx), grown by a margin [px] as far as the star's light allows.
+
+        They grow by whole pixels while the light beside them remains that of a core.
+        significance, usable: see `star_cores`
+        """
+        grown = self.masked
+        for _ in range(margin):
+            wider = binary_dilation(grown, np.ones((3, 3), bool))
+            if _brightest_beside(significance, usable & ~wider, wider) < MIN_EDGE_SIGMAS:
+                break
+            grown = wider
+        return grown
+
 
 def star_cores(significance, usable, psf, band) -> list[StarCore]:
     """Finds the stars with a masked core in a channel, the brightest first.

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import (
-    binary_dilation,
     distance_transform_edt,
     gaussian_filter,
     map_coordinates,
@@ -95,8 +94,8 @@ def with_star_psfs(image, sources, places, sky):
     """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
 
     The masked pixels of all cores grow by WIDE_GROW_PX, or `spoilt.GROW_PX` for stars with cores
-    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed. Without any core the image is returned
-    unchanged.
+    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed; see `StarCore.grown`. Without any core
+    the image is returned unchanged.
 
     sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
     sky: True if a sky level is fitted
@@ -115,8 +114,8 @@ def with_star_psfs(image, sources, places, sky):
                 is_wide or isinstance(sources[i], PointSource)
             ):
                 grow = WIDE_GROW_PX if is_wide else GROW_PX
-                wide[c] |= image.usable[c] & binary_dilation(
-                    core.masked, np.ones((3, 3), bool), grow
+                wide[c] |= image.usable[c] & core.grown(
+                    image.significance[c], image.usable[c], grow
                 )
                 if is_wide:
                     found.setdefault(i, {})[c] = core

@@ -90,8 +90,8 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     """
     core_and_halo = radial * CORE, radial * HALO
     if isinstance(shape, StarProfile):
-        drawn = shape.draw(np.zeros(len(theta)), position)
-        drawn = drawn[:, *box_slices(origin, profile.shape)] / drawn[0].max()
+        drawn = shape.draw_box(np.zeros(len(theta)), position, origin, profile.shape)
+        drawn /= drawn[0].max()
         return drawn[1:], shape.scatter, OutsideBoxMoments.none(len(theta))
     if isinstance(shape, GalaxyProfile):
         low, size = _surroundings(shape, theta, position, np.array(origin), profile.shape)

@@ -23,7 +23,9 @@ import numpy as np
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
+from ...sky.sources import PointSource
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
+from ..sampled_psf import sampled_psfs
 from ..view import WhitenedView, pixel_noise
 from .component_batch import StartComponent, renumbered
 from .linearised_scenes import linearise
@@ -48,6 +50,7 @@ class StartInput:
     frame: Frame; sources (S), positions (S, 2) [px]: those inside it; views: WhitenedViews
     thetas (S): for each source None, or the parameters (n,) of each of its components, from which
         it starts; (): None for all
+    observations: those of the views, for the PSFs of stars; (): stars of the model's PSF alone
     """
 
     frame: Frame
@@ -55,6 +58,7 @@ class StartInput:
     positions: np.ndarray
     views: list[WhitenedView]
     thetas: tuple = ()
+    observations: tuple = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +204,10 @@ def _components(patches):
     for b, patch in enumerate(patches):
         n = 0
         for i, (source, position) in enumerate(zip(patch.sources, patch.positions, strict=True)):
-            for shape in components_of(source, patch.frame):
-                place = np.array(position, dtype=np.float64)
+            place, sampled = np.array(position, dtype=np.float64), ()
+            if isinstance(source, PointSource):
+                sampled = sampled_psfs(patch.frame, patch.observations, place)
+            for shape in components_of(source, patch.frame, sampled):
                 components.append(StartComponent(b, n, i, shape, place, patch.frame.shape))
                 sources.append(i)
                 n += 1

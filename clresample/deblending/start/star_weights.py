@@ -33,16 +33,16 @@ def allow_for_psf_error(frame, views, stars, psf_error) -> list[WhitenedView]:
     stars = [one for one, top in zip(stars, most, strict=True) if top >= MIN_PSF_ERROR_SIGMA]
     if not stars:
         return views
-    shape, out = StarProfile(frame, free=True), []
+    shapes, out = [StarProfile(frame, free=True, sampled=one[0].sampled) for one in stars], []
     components = [
         StartComponent(0, k, source, shape, place, frame.shape)
-        for k, (_, source, place, _) in enumerate(stars)
+        for k, (shape, (_, source, place, _)) in enumerate(zip(shapes, stars, strict=True))
     ]
     spectra, noise = np.array([one[3] for one in stars]), pixel_noise(views)
     precision = Precision.of(views[0].op.dtype)
     looking = linearise([views], components, precision, 0.0, fit_sky=False)
-    brightness = shape.peak * (spectra / noise).max(axis=1)
-    thetas = [shape.mean] * len(stars)
+    brightness = shapes[0].peak * (spectra / noise).max(axis=1)
+    thetas = [shape.mean for shape in shapes]
     looking.render(np.arange(1), thetas, brightness, slopes=True, whiten=False)
     parts = np.split(spectra, ends, axis=1)
     for view, sight, part in zip(views, looking.sights, parts, strict=True):

@@ -1,0 +1,101 @@
+"""Stars on the pixels of an observation whose PSF has waves shorter than two of them."""
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from clresample.deblending.inspection.star_psfs import StarPSFs
+from clresample.deblending.profiles import ALIAS_PX, StarProfile, draw_psf
+from clresample.deblending.sampled_psf import MAX_REACH_PX, reach_px, sampled_psfs
+from clresample.resampling.resampler import Resampler
+from clresample.sky.frame import Frame, model_psf
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation, with_psf_field
+from clresample.sky.psf import PSF
+
+SHAPE, SIGMA = (41, 45), 0.45  # of the light before the pixel [px]
+GRID = Grid.flat(SHAPE, 0.1)
+PLACES = [(20.0, 22.0), (20.5, 22.5), (19.7, 21.2)]
+
+
+def pixel_psf():
+    """The effective PSF, of a Gaussian behind square pixels, four samples a pixel."""
+    u = (np.arange(81) - 40) / 4
+    edges = [erf((u + d) / (np.sqrt(2) * SIGMA)) for d in (0.5, -0.5)]
+    return PSF(np.outer(edges[0] - edges[1], edges[0] - edges[1]), spacing=0.25)
+
+
+def exact(place):
+    """Light in the pixels of a star of unit flux at a place (2,) [px]."""
+    sides = []
+    for n, c in zip(SHAPE, place, strict=True):
+        edges = erf((np.arange(n + 1) - 0.5 - c) / (np.sqrt(2) * SIGMA))
+        sides.append(np.diff(edges) / 2)
+    return np.outer(*sides)
+
+
+def observation(psf=None, grid=GRID):
+    psf = pixel_psf() if psf is None else psf
+    return Observation(np.zeros(grid.shape), psf, grid, weights=1.0, channels=("r",), name="cam")
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_stars_are_exact_on_the_pixels_that_alias_their_light(device, place):
+    psf, model = pixel_psf(), model_psf(0.8)
+    op = Resampler(GRID, model, GRID, psf, device=device, dtype=np.float64)
+    wanted = exact(place)
+    own, smooth = (
+        op(draw_psf(model, place, SHAPE, slopes=False, sampled=sampled)) - wanted
+        for sampled in ((psf,), ())
+    )
+    assert np.abs(own).max() < 1e-3 * wanted.max()
+    assert np.abs(smooth).max() > 0.02 * wanted.max()
+
+
+def test_slopes_are_those_by_the_position():
+    psf, place, h = (pixel_psf(),), np.array([19.7, 21.2]), 1e-4
+    drawn = draw_psf(model_psf(0.8), place, SHAPE, sampled=psf)
+    for axis, unit in enumerate(np.eye(2) * h):
+        ends = [draw_psf(model_psf(0.8), place + s * unit, SHAPE, sampled=psf)[0] for s in (1, -1)]
+        np.testing.assert_allclose(drawn[1 + axis], (ends[0] - ends[1]) / (2 * h), atol=1e-6)
+
+
+def test_a_psf_without_short_waves_changes_nothing():
+    smooth, model = PSF.gaussian(1.8, n_pixels=81, spacing=0.5), model_psf(0.8)
+    old, new = (draw_psf(model, (20.5, 22.25), SHAPE, sampled=some) for some in ((), (smooth,)))
+    middle = np.s_[:, 17:25, 19:27]
+    np.testing.assert_allclose(new[middle], old[middle], atol=0.02 * old[0].max())
+
+
+def test_boxes_hold_the_waves_of_bright_stars():
+    home = Frame(GRID, model_psf(0.8))
+    star, plain = (StarProfile(home, free=True, sampled=s) for s in ((pixel_psf(),), ()))
+    place = np.array([20.0, 22.0])
+    reach = [star.bounding_box(np.zeros(2), place, t)[1][0] for t in (1e-2, 1e-5, 1e-7)]
+    assert reach[0] == plain.bounding_box(np.zeros(2), place, 1e-7)[1][0]
+    assert reach[0] < reach[1] < reach[2] <= ALIAS_PX[1] + 1
+    assert reach_px([pixel_psf()]) == 11
+    assert reach_px([PSF.gaussian(3.0, n_pixels=2 * MAX_REACH_PX + 9)]) == MAX_REACH_PX
+
+
+@pytest.mark.parametrize(
+    "psf, grid, n",
+    [
+        (None, GRID, 1),
+        (None, GRID.cutout(-3, 5, (50, 51)), 1),
+        (PSF.gaussian(1.0), GRID, 0),  # no sample between pixels
+        (None, Grid.flat(SHAPE, 0.1, center_arcsec=(0.03, 0)), 0),  # between the frame's pixels
+        (None, Grid.flat(SHAPE, 0.2), 0),
+    ],
+)
+def test_psfs_are_of_observations_on_the_frames_pixels(psf, grid, n):
+    found = sampled_psfs(Frame(GRID, model_psf(0.8)), [observation(psf, grid)], (20.3, 22.4))
+    assert len(found) == n
+
+
+def test_stars_with_psfs_of_their_own_are_left_out():
+    psf, place = pixel_psf(), np.array([20.3, 22.4])
+    field = StarPSFs(psf, None, place[None], (psf,), np.zeros((1, 1)))
+    home, one = Frame(GRID, model_psf(0.8)), with_psf_field(observation(), field)
+    assert sampled_psfs(home, [one], place) == ()
+    assert sampled_psfs(home, [one], place + 5) == (psf,)
