@@ -141,6 +141,7 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
         SimpleNamespace(
             patch=k,
             settings=SimpleNamespace(fit_sky=100),
+            forget_start=lambda: None,
             begin=lambda *given: asked.append(given),
             blend=SimpleNamespace(structures=(k,) * k),
         )

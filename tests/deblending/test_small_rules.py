@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.scenes import blend
 
+from clresample.deblending import fit as fit_module
 from clresample.deblending.fit import Fit, render_fits, start_fits
 from clresample.deblending.posterior import aligned_observation
 from clresample.deblending.posterior.aligned_observation import (
@@ -68,13 +69,20 @@ def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
     assert pairs.count.tolist() == [1, 0, 0, 1]
 
 
-def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
+def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device, monkeypatch):
+    """Once, however often the fit starts."""
+
+    def lowered(patch, point, settings):
+        views = patch.views
+        return [replace(v, sqrt_weights=0.5 * v.sqrt_weights) for v in views], point
+
+    monkeypatch.setattr(fit_module, "with_psf_error_weights", lowered)
     one = Fit(blend(), Settings(), device, np.float32, pad=1)
-    one.views = [replace(view, sqrt_weights=0.5 * view.sqrt_weights) for view in one.views]
-    start_fits([one])
-    for weights, view in zip(one.scene.weights, one.views, strict=True):
-        np.testing.assert_allclose(weights, view.sqrt_weights**2)
-        assert 0 < weights.max() < 0.3
+    for _ in range(2):
+        start_fits([one])
+        for weights, view in zip(one.scene.weights, one.views, strict=True):
+            np.testing.assert_allclose(weights, view.sqrt_weights**2)
+            assert 0.2 < weights.max() < 0.3
 
 
 def test_seconds_are_those_that_passed(device):
