@@ -169,6 +169,15 @@ def _otf(psf, n_fft):
     return psf.otf(np.fft.fftfreq(n_fft), np.fft.rfftfreq(n_fft))[0]
 
 
+@functools.lru_cache(maxsize=N_OTFS)
+def _light_beside(psf, sampled, n):
+    """Largest light (n + 1,) [peak] of a star on each square of pixels about it; see `draw_psf`."""
+    shape = (2 * n + 1, 2 * n + 1)
+    image = draw_psf(psf, (n, n), shape, slopes=False, sampled=sampled)[0]
+    away = np.abs(np.indices(shape) - n).max(axis=0)
+    return ndimage.maximum(np.abs(image), away, np.arange(n + 1)) / image.max()
+
+
 class ComponentProfile:
     """The smooth profile of a component.
 
@@ -269,7 +278,6 @@ class StarProfile(ComponentProfile):
         self.shape, self.psf, self.free, self.sampled = frame.shape, frame.psf, free, sampled
         self.mean = np.zeros(2 if free else 0)
         self.scatter = np.full(len(self.mean), STAR_SCATTER_PX)
-        self._tails: dict[int, np.ndarray] = {}
 
     def draw(self, theta, position, shape=None):
         """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
@@ -288,20 +296,11 @@ class StarProfile(ComponentProfile):
         half = max(self.psf.images.shape[1:]) * self.psf.spacing / 2
         end = half
         for n in ALIAS_PX if self.sampled else ():
-            end = np.flatnonzero(self._tail(n) > ALIAS_THRESHOLDS * threshold).max(initial=0)
+            light = _light_beside(self.psf, self.sampled, n)
+            end = np.flatnonzero(light > ALIAS_THRESHOLDS * threshold).max(initial=0)
             if end < n:
                 break
         return self.center(theta, position), np.full(2, max(half, end) + 1)
-
-    def _tail(self, n):
-        """Largest light (n + 1,) [peak] of the star on each square of pixels about it, kept."""
-        if n not in self._tails:
-            shape = (2 * n + 1, 2 * n + 1)
-            image = draw_psf(self.psf, (n, n), shape, slopes=False, sampled=self.sampled)[0]
-            away = np.abs(np.indices(shape) - n).max(axis=0)
-            light = ndimage.maximum(np.abs(image), away, np.arange(n + 1))
-            self._tails[n] = light / image.max()
-        return self._tails[n]
 
     def center(self, theta, position):
         """Position of the component (2,) [px]."""

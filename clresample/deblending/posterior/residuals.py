@@ -8,6 +8,7 @@ import numpy as np
 
 from ...sky.noise import HALF_WIDTH
 from ..component_images import image_within, window_of
+from ..solver.multiscale.prior import gaussian
 
 # [sigma] Filtered residual from which a source is flagged as misfitted: noise reaches it in one of
 # 20 large blends, each with 1e5 pixels in all channels.
@@ -184,10 +185,9 @@ def _kernels(psf):
     """Images of the PSF on the observation's pixels; of an oversampled one, Gaussians as wide."""
     if psf.spacing == 1:
         return psf.images
-    sigma_px = psf.fwhm_px[:, None] / np.sqrt(8 * np.log(2))
-    side = np.exp(-0.5 * (np.arange(-KERNEL_PX, KERNEL_PX + 1) / sigma_px) ** 2)
-    side /= side.sum(axis=1, keepdims=True)
-    return side[:, :, None] * side[:, None]
+    sigma_px = psf.fwhm_px / np.sqrt(8 * np.log(2))
+    sides = [gaussian(sigma, KERNEL_PX, unit_sum=True) for sigma in sigma_px]
+    return np.array([np.outer(side, side) for side in sides])
 
 
 def _owners(result, i_observation, positions):

@@ -30,6 +30,7 @@ import numpy as np
 
 from ...sky.box import intersect_boxes
 from ..profiles import GalaxyProfile
+from ..solver.multiscale.prior import without_profile
 from ..start.population import contamination_factors
 from .errors import FluxChanges
 from .profile_modes import SCATTER, SHAPE_MODES
@@ -131,7 +132,7 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
     scene, source = solution.scene, solution.source
     out = np.zeros((n_sources, n_sources, len(result.channels)))
     structure = [
-        np.zeros(p.shape) if fixed else _structure(c.morphology, p)
+        np.zeros(p.shape) if fixed else without_profile(c.morphology, p)
         for c, p, fixed in zip(components, scene.profile, scene.fixed, strict=True)
     ]
     low, high = scene.origin, scene.origin + [p.shape for p in scene.profile]
@@ -153,13 +154,6 @@ def _larger_profile(solution, i, growth):
     theta[0] += growth
     place = solution.positions[i], scene.origin[i], scene.profile[i].shape
     return solution.shapes[i].draw_box(theta, *place, slopes=False)[0]
-
-
-def _structure(morphology, profile):
-    """Part of a morphology (ny, nx) beside its profile."""
-    return (
-        morphology - (morphology * profile).sum() / max(np.square(profile).sum(), 1e-30) * profile
-    )
 
 
 def with_shared_light(errors, doubts, exchanged):

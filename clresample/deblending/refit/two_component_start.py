@@ -15,7 +15,7 @@ import numpy as np
 from ...sky.sources import ExtendedSource
 from ..ended import Ended
 from ..profiles import COMPONENT_SPREAD, FixedProfile, GalaxyProfile
-from ..solver.multiscale.structure import coarse_count
+from ..solver.multiscale.structure import no_structure
 from ..solver.scene import StructureState
 from ..start.final_render import best_starts
 from ..start.first_scene import first_scene
@@ -208,8 +208,7 @@ def _going_on(state, first, before, new):
     end, steps = first.state, first.settings.prior.steps
     known, structure, morph = end.learned, [], []
     for i, is_new, begin in zip(before, new, state.morph, strict=True):
-        nothing = [np.zeros(coarse_count(begin.shape, step)) for step in steps]
-        structure.append(nothing if is_new else known.structure[i])
+        structure.append(no_structure(begin.shape, steps) if is_new else known.structure[i])
         morph.append(begin if is_new else end.morph[i])
     learned = StructureState(structure, known.strengths[before], known.clear[before])
     return replace(state, morph=morph, learned=learned)

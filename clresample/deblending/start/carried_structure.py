@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from ..solver.multiscale.prior import MultiscalePrior, kernel_rows
-from ..solver.multiscale.structure import coarse_count
+from ..solver.multiscale.prior import MultiscalePrior, kernel_rows, without_profile
+from ..solver.multiscale.structure import coarse_count, no_structure
 from ..solver.scene import StructureState
 from .final_render import best_starts
 from .profile_start import by_size
@@ -70,7 +70,7 @@ def _with_structure(fit, known):
             morph = morphology(profile, structure[-1], prior)
             strengths[k], clear[k] = known[k].strengths, known[k].clear
         else:
-            structure.append([np.zeros(coarse_count(profile.shape, step)) for step in prior.steps])
+            structure.append(no_structure(profile.shape, prior.steps))
         morphs.append(morph)
     return replace(fit.state, morph=morphs, learned=StructureState(structure, strengths, clear))
 
@@ -97,4 +97,4 @@ def morphology(profile, structure, prior):
         along_y, along_x = (kernel_rows(prior, j, n) for n in profile.shape)
         u += along_y.T @ z @ along_x
     u *= prior.amplitude(profile)
-    return np.maximum(profile + u - profile * ((profile * u).sum() / (profile**2).sum()), 0)
+    return np.maximum(profile + without_profile(u, profile), 0)

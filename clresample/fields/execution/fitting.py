@@ -146,6 +146,7 @@ def _fitted(job, group, given):
             _set_aside(part, job, patch, group.round, "no pixel here has a weight")
             continue
         cut = _BlendCutout(patch, blend, boxes, time.perf_counter() - start)
+        # numbers of components are not tested in each round: a borderline source would alternate
         before = given.before.get(number, ({}, {}))
         cuts.append(cut.joined(more, *before, single=1))
     cuts, results = _fits_of(job, given, cuts, part, group.round)

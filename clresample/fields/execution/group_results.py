@@ -159,6 +159,11 @@ def _floats(array, name):
     return fits.ImageHDU(array if array.size else None, name=name)
 
 
+def _owners(components):
+    """(id of the source, patch) of each of a table of COMPONENT_COLUMNS."""
+    return list(zip(components["id"].tolist(), components["fit_id"].tolist(), strict=True))
+
+
 @dataclass(frozen=True)
 class GroupResultsFile:
     """A part on disk."""
@@ -173,14 +178,13 @@ class GroupResultsFile:
 
     def owners(self) -> list[tuple[int, int]]:
         """(id of the source, patch) of each component."""
-        (table,) = self.read("COMPONENTS")
-        return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
+        return _owners(*self.read("COMPONENTS"))
 
     def profiles(self, chosen) -> dict[int, tuple[tuple[float, ...], ...]]:
         """Parameters {id: (n,) of each component} of the sources of the patches in `chosen`."""
         found: dict[int, tuple] = {}
-        (thetas,) = self.read("THETAS")
-        for (source, patch), theta in zip(self.owners(), thetas, strict=True):
+        table, thetas = self.read("COMPONENTS", "THETAS")
+        for (source, patch), theta in zip(_owners(table), thetas, strict=True):
             if patch in chosen:
                 own = tuple(theta[np.isfinite(theta)].tolist())
                 found[source] = (*found.get(source, ()), own)
@@ -198,7 +202,7 @@ class GroupResultsFile:
         ends = np.cumsum(rows[:, 1] * rows[:, 2])
         places = np.stack([table["y0"], table["x0"]], axis=1) - np.array(corner)
         found: dict[int, tuple] = {}
-        for i, (source, number) in enumerate(self.owners()):
+        for i, (source, number) in enumerate(_owners(table)):
             if number == patch:
                 own, one = np.flatnonzero(rows[:, 0] == i), None
                 if len(own):

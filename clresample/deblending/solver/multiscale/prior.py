@@ -73,6 +73,11 @@ def gaussian(sigma, radius, *, unit_sum=False):
     return k / (k.sum() if unit_sum else np.linalg.norm(k))
 
 
+def without_profile(image, profile):
+    """An image (ny, nx) less its projection on a profile (ny, nx)."""
+    return image - profile * ((profile * image).sum() / max(np.square(profile).sum(), 1e-30))
+
+
 @functools.lru_cache(maxsize=32)
 def kernel_rows(prior, j, n):
     """K_j of each coefficient along a side of `n` pixels (n_j, n)."""

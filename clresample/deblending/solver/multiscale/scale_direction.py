@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .prior import kernel_rows
+from .prior import kernel_rows, without_profile
 
 # Conjugate gradients for a wanted u, and the variance [1] that is added to the prior's of
 # u / sqrt(p): with 30 and 1e-5 the data's curvature along the direction is a tenth of the prior's
@@ -33,7 +33,7 @@ class ScaleDirection:
 def scale_coefficients(prior, profile, strengths):
     """Coefficients [j] (ny_j, nx_j) with u = p, nearly, and the change (ny, nx) of S by them."""
     z, u = coefficients_of(prior, profile, profile, strengths)
-    return z, u - profile * ((profile * u).sum() / (profile * profile).sum())
+    return z, without_profile(u, profile)
 
 
 def coefficients_of(prior, profile, wanted, strengths, window=None):

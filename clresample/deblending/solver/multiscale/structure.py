@@ -21,6 +21,11 @@ def coarse_count(n_pixels, step):
     return (np.asarray(n_pixels) + step - 2) // step + 1
 
 
+def no_structure(shape, steps):
+    """Coefficients (J) of 0 in a box of a shape (2,), as arrays (ny_j, nx_j)."""
+    return [np.zeros(coarse_count(shape, step)) for step in steps]
+
+
 class LatentLayout:
     """Layout of the coefficients of all free sources of a batch in one vector.
 
