@@ -46,11 +46,15 @@ def unlike():
 
 
 def test_unlike_devices_agree(unlike):
+    """Soon after the start. These sources overlap at a signal to noise of a thousand: data that
+    differ by 1e-7 change losses by up to 3e-3 on one device too, and by 2e-2 after six iterations.
+    """
+    settings = Settings(max_iter=3)
     given = blends(6, unlike[0])
-    together = deblend_many(given, settings=SETTINGS, device=unlike)
-    alone = deblend_many(given, settings=SETTINGS, device=unlike[0])
+    together = deblend_many(given, settings=settings, device=unlike)
+    alone = deblend_many(given, settings=settings, device=unlike[0])
     for one, other in zip(together, alone):
-        np.testing.assert_allclose(one.losses[-1], other.losses[-1], rtol=1e-3)
+        np.testing.assert_allclose(one.losses[-1], other.losses[-1], rtol=1e-2)
 
 
 def test_unlike_devices_work_side_by_side_in_one_process(unlike):
