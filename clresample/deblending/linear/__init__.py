@@ -3,8 +3,8 @@
 The start, finished fits, the test of colours and the weights of stars use many scenes at once, on
 the device. linearised_scenes.py renders the components of all scenes in all observations and solves
 for spectra; component_batch.py draws them in boxes, which render_planner.py and renderer.py render
-in the pixels that their light reaches; slot_observation.py sums their products over the pixels of
-one observation; equations.py makes normal equations of the parameters from these sums;
+in windows placed by placing.py, as the solver's; slot_observation.py sums their products over the
+pixels of one observation; equations.py makes normal equations of the parameters from these sums;
 rendered_models.py does it for given morphologies.
 Errors and joint steps use up to hundreds of modes of each component of one scene, on the host.
 mode_images.py has their images, aligned_observation.py renders them, normal.py sums their products
