@@ -40,6 +40,9 @@ ALLOWED_IMPORTS = {
         "report",
     ),
 }
+# Packages of deblending that know nothing of the fits around them, and what they import of it.
+DEBLENDING = "clresample.deblending."
+INNER_IMPORTS = {"linear.": ("component_images", "profiles", "view"), "solver.": ("linear.",)}
 # Packages that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
 # Over a limit the test fails; over what is enough for nearly all it warns.
@@ -92,10 +95,11 @@ def violations(name, source, is_package=False):
             package, ()
         ):
             yield target
-        inside = "clresample.deblending.solver."
-        leaves = package_of(target) == "deblending" and not target.startswith(inside)
-        if name.startswith(inside) and leaves:  # the solver knows nothing of the fits around it
-            yield target
+        for inside, allowed in INNER_IMPORTS.items():
+            within = tuple(DEBLENDING + other for other in (inside, *allowed))
+            leaves = target.startswith(DEBLENDING) and not target.startswith(within)
+            if name.startswith(DEBLENDING + inside) and leaves:
+                yield target
 
 
 def graph():
@@ -196,9 +200,18 @@ def test_an_upward_import_is_seen(line):
     assert list(violations("clresample.sky.psf", line))
 
 
-def test_the_solver_is_kept_from_the_fits_around_it():
-    assert list(violations("clresample.deblending.solver.gradient", "from ..fit import Fit"))
-    assert not list(violations("clresample.deblending.solver.gradient", "from .boxes import Boxes"))
+@pytest.mark.parametrize("module", ["solver.gradient", "linear.normal"])
+def test_inner_packages_are_kept_from_the_fits_around_them(module):
+    name = f"clresample.deblending.{module}"
+    for upward in ("from ..fit import Fit", "from ..posterior.modes import Solution"):
+        assert list(violations(name, upward))
+    assert not list(violations(name, "from ..linear.ties import Ties"))
+
+
+def test_linear_is_below_the_solver():
+    name = "clresample.deblending.linear.ties"
+    assert list(violations(name, "from ..solver.boxes import Boxes"))
+    assert not list(violations(name, "from ..view import WhitenedView"))
 
 
 def test_a_circle_is_seen():

@@ -13,11 +13,11 @@ from ..sky.frame import Frame
 from .component_images import ComponentImages
 from .ended import Ended
 from .inspection.inspect import inspect
+from .linear.rendered_models import MorphologyModel, RenderedModel, render_models
 from .posterior.posterior import with_errors
 from .result import Component, Result
 from .solver.scene import ComponentStructure, image_numbers, signature_of
 from .start.carried_structure import carry_structure
-from .start.final_render import MorphologyModel, RenderedModel, render_models
 from .start.first_scene import first_scene
 from .start.profile_start import (
     LIGHT_SIGMAS,

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from .linear.normal import SCATTER_PX
 from .solver.scene_model import compose
 
 # Largest assumed ratio of successive steps.
 MAX_DECAY_FACTOR = 0.8
-# [model px] Prior scatter of a shift. If the data leave a larger uncertainty, the step goes to 0.
-# With a larger value noise would shift observations with hardly any light.
-SCATTER_PX = 2.0
 
 
 def shift_steps(scene, state) -> tuple[np.ndarray, float]:

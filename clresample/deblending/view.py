@@ -13,7 +13,7 @@ from ..resampling.resampler import Resampler
 from ..sky.frame import Frame
 from ..sky.mapping import Mapping
 from ..sky.varying_psf.basis import PSFBasis
-from .solver.rendering.ties import Ties
+from .linear.ties import Ties
 
 # Pixels of a model below this fraction of its brightest are set to 0 before rendering: their light
 # is negligible, but in float32 they would become denormals, which are 20 times slower.

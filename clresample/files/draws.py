@@ -6,10 +6,10 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from ..deblending.posterior.block_matrix import BlockCholesky
+from ..deblending.linear.block_matrix import BlockCholesky
+from ..deblending.linear.mode_images import CellImages, ModeImages
+from ..deblending.linear.ties import Ties
 from ..deblending.posterior.errors import FluxChanges, PosteriorSampler
-from ..deblending.posterior.mode_images import CellImages, ModeImages
-from ..deblending.solver.rendering.ties import Ties
 from .array_hdus import array_of, image_hdu
 
 NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel")

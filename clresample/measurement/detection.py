@@ -22,7 +22,7 @@ import numpy as np
 
 from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
-from ..deblending.spectra import MODEL_ERROR
+from ..deblending.linear.spectra import MODEL_ERROR
 from ..drawing.display import ShownDetection
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, as_observations

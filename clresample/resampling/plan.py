@@ -98,6 +98,12 @@ class ResamplingPlan:
         return self.mapping.geometry
 
     @property
+    def layout(self) -> tuple:
+        """Properties that plans share to be used side by side, images of equal sizes apart."""
+        by_row = None if self.lines is None else self.lines.by_row
+        return self.geometry, self.axes, self.n_terms, by_row
+
+    @property
     def n_bytes(self) -> int:
         """Host memory of the tables and the mapping [bytes]."""
         values = (value for part in (self, self.mapping) for value in vars(part).values())

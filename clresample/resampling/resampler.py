@@ -78,9 +78,7 @@ class Resampler(GridOperator):
     @property
     def layout(self):
         """Properties that must be equal for operators to serve one batch: see from_plans."""
-        plan = self.plans[0]
-        by_row = None if plan.lines is None else plan.lines.by_row
-        return self.geometry, plan.axes, self.shape_in, self.shape_out, by_row
+        return *self.plans[0].layout, self.shape_in, self.shape_out
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """The plan of a mapping, with its warnings, and its tables on the device."""

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.posterior import normal
-from clresample.deblending.posterior.block_matrix import RIDGE, BlockCholesky, BlockMatrix
-from clresample.deblending.posterior.normal import _NormalAccumulator
+from clresample.deblending.linear import normal
+from clresample.deblending.linear.block_matrix import RIDGE, BlockCholesky, BlockMatrix
+from clresample.deblending.linear.normal import _NormalAccumulator
 
 
 def field(n_y, n_x, *, common=0, seed=0):

@@ -10,8 +10,8 @@ from helpers.scenes import MODEL_PSF
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages, local_chi2
+from clresample.deblending.linear.rendered_models import RenderedModel
 from clresample.deblending.posterior.bound_bias import negative_chi2_gradient
-from clresample.deblending.start.final_render import RenderedModel
 from clresample.measurement.photometry import fluxes
 from clresample.sky.frame import Frame
 from clresample.sky.sources import ExtendedSource

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.start import point_of
 
+from clresample.deblending.linear.spectra import spectrum_covariance
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.spectra import spectrum_covariance
 from clresample.deblending.start.boxes import box_around, box_threshold, component_box
 from clresample.paper.resize import _box, _moved, _same
 

@@ -9,15 +9,15 @@ from helpers.scenes import GALAXIES, SHAPE, frame, observe, sources
 from helpers.start import rendered, view, views
 from scipy.optimize import lsq_linear
 
+from clresample.deblending.linear.component_batch import ComponentBatch, StartComponent, boxes_of
+from clresample.deblending.linear.equations import normal_equations
+from clresample.deblending.linear.linearised_scenes import linearise
+from clresample.deblending.linear.slot_observation import smoothed_light
+from clresample.deblending.linear.spectra import nnls_batch, spectrum_covariance
 from clresample.deblending.profiles import GalaxyProfile, StarProfile
-from clresample.deblending.spectra import nnls_batch, spectrum_covariance
 from clresample.deblending.start import profile_fit, profile_start as start_module
-from clresample.deblending.start.component_batch import ComponentBatch, StartComponent, boxes_of
-from clresample.deblending.start.equations import normal_equations
-from clresample.deblending.start.linearised_scenes import linearise
 from clresample.deblending.start.profile_fit import ProfileFit
 from clresample.deblending.start.profile_start import StartInput
-from clresample.deblending.start.slot_observation import smoothed_light
 from clresample.deblending.view import WhitenedView
 from clresample.device.tuning import Tuning
 from clresample.resampling.cache import cached_resampler

@@ -8,10 +8,10 @@ from helpers.told import named
 
 from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.ended import Ended
+from clresample.deblending.linear.rendered_models import RenderedModel, model_of
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
-from clresample.deblending.start.final_render import RenderedModel, model_of
 from clresample.sky.sources import ExtendedSource, PointSource
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from clresample.deblending import spectra as spectra_module
-from clresample.deblending.spectra import RIDGE
-from clresample.deblending.start import linearised_scenes as module
-from clresample.deblending.start.equations import normal_equations
-from clresample.deblending.start.linearised_scenes import LinearisedScenes
+from clresample.deblending.linear import linearised_scenes as module, spectra as spectra_module
+from clresample.deblending.linear.equations import normal_equations
+from clresample.deblending.linear.linearised_scenes import LinearisedScenes
+from clresample.deblending.linear.spectra import RIDGE
 
 N_SCENES, N_PIXELS = 3, 60
 # scene, index there, parameters, first and one-past-last pixel of its light, of each component;

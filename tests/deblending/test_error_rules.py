@@ -6,16 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.posterior import (
-    aligned_observation as module,
-    posterior as posterior_module,
-)
-from clresample.deblending.posterior.aligned_observation import (
+from clresample.deblending.linear import aligned_observation as module
+from clresample.deblending.linear.aligned_observation import (
     AlignedObservation,
     BandLimitedTransfer,
 )
-from clresample.deblending.posterior.block_matrix import BlockMatrix
-from clresample.deblending.posterior.normal import UnknownLayout
+from clresample.deblending.linear.block_matrix import BlockMatrix
+from clresample.deblending.linear.normal import UnknownLayout
+from clresample.deblending.posterior import posterior as posterior_module
 from clresample.deblending.posterior.posterior import FAR_ERROR, Posterior
 from clresample.deblending.posterior.profile_modes import OutsideBoxMoments
 from clresample.deblending.result import Component

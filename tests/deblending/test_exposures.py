@@ -21,7 +21,7 @@ from clresample import (
 )
 from clresample.deblending.fit import Fit, render_fits, start_fits
 from clresample.deblending.iterate import iterate
-from clresample.deblending.posterior.aligned_observation import align_observations
+from clresample.deblending.linear.aligned_observation import align_observations
 from clresample.deblending.posterior.posterior import Posterior, posterior_of
 from clresample.deblending.refit.colour_gradient import run_gradient_tests
 from clresample.device.device import get_device

@@ -7,10 +7,10 @@ import pytest
 from helpers.scenes import BRIGHT, SHAPE, frame, observe
 from helpers.start import least_squares, rendered, view, views
 
+from clresample.deblending.linear import rendered_models as room
+from clresample.deblending.linear.rendered_models import MorphologyModel, render_models
+from clresample.deblending.linear.slot_observation import SlotObservation
 from clresample.deblending.profiles import StarProfile
-from clresample.deblending.start import final_render as room
-from clresample.deblending.start.final_render import MorphologyModel, render_models
-from clresample.deblending.start.slot_observation import SlotObservation
 from clresample.deblending.start.star_weights import MIN_PSF_ERROR_SIGMA, allow_for_psf_error
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.psf import PSF

@@ -10,12 +10,12 @@ import pytest
 from helpers.scenes import BRIGHT, SHAPE, frame, observe, sources
 from helpers.start import least_squares, profiles, rendered, views
 
+from clresample.deblending.linear.linearised_scenes import linearise
+from clresample.deblending.linear.render_planner import SIZE_PX
+from clresample.deblending.linear.slot_observation import smoothed_light
 from clresample.deblending.settings import Settings
 from clresample.deblending.start import profile_start as start_module
-from clresample.deblending.start.linearised_scenes import linearise
 from clresample.deblending.start.profile_start import StartInput
-from clresample.deblending.start.render_planner import SIZE_PX
-from clresample.deblending.start.slot_observation import smoothed_light
 from clresample.resampling.plan import Precision
 
 SKY = (0.3, -0.2, 0.1)

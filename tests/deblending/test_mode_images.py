@@ -5,9 +5,7 @@ import pytest
 from helpers import scenes
 
 from clresample import Settings
-from clresample.deblending.posterior import smooth_modes
-from clresample.deblending.posterior.errors import PosteriorSampler
-from clresample.deblending.posterior.mode_images import (
+from clresample.deblending.linear.mode_images import (
     CellImages,
     ModeImages,
     cell_sums,
@@ -15,6 +13,8 @@ from clresample.deblending.posterior.mode_images import (
     subtract,
     sums_with,
 )
+from clresample.deblending.posterior import smooth_modes
+from clresample.deblending.posterior.errors import PosteriorSampler
 from clresample.deblending.posterior.posterior import Posterior
 from clresample.files.draws import draw_hdus, read_draws
 

@@ -10,7 +10,7 @@ from helpers.scenes import BRIGHT, blend
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.inspection.inspect import InputWarning
-from clresample.deblending.posterior import aligned_observation, posterior
+from clresample.deblending.linear import aligned_observation, posterior
 from clresample.deblending.posterior.moments import moment_derivatives
 from clresample.deblending.settings import Settings
 from clresample.files import results as store

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.posterior.normal import UnknownLayout, normal_matrix
-from clresample.deblending.shifts import SCATTER_PX
+from clresample.deblending.linear.normal import SCATTER_PX, UnknownLayout, normal_matrix
 
 SHAPE = 15, 17
 # (y0, x0, ny, nx) of boxes: the second meets the others, but those not each other; the fourth is

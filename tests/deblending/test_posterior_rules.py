@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers import scenes
 
+from clresample.deblending.linear.normal import UnknownLayout, _by_channel
 from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.errors import PosteriorSampler
 from clresample.deblending.posterior.modes import STRENGTH, Solution, clipped_power
-from clresample.deblending.posterior.normal import UnknownLayout, _by_channel
 from clresample.deblending.posterior.profile_modes import (
     FAR_LIGHT,
     OutsideBoxMoments,

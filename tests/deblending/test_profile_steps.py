@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clresample.deblending.linear.linearised_scenes import LinearisedScenes
 from clresample.deblending.start import profile_fit
-from clresample.deblending.start.linearised_scenes import LinearisedScenes
 from clresample.deblending.start.population import OWN_LIGHT
 from clresample.deblending.start.profile_fit import ProfileFit
 

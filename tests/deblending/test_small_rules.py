@@ -9,8 +9,8 @@ from helpers.scenes import blend
 
 from clresample.deblending import fit as fit_module
 from clresample.deblending.fit import Fit, render_fits, start_fits
-from clresample.deblending.posterior import aligned_observation
-from clresample.deblending.posterior.aligned_observation import (
+from clresample.deblending.linear import aligned_observation
+from clresample.deblending.linear.aligned_observation import (
     AlignedObservation,
     BandLimitedTransfer,
 )

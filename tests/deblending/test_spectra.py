@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from clresample.deblending import spectra
-from clresample.deblending.spectra import (
+from clresample.deblending.linear import spectra
+from clresample.deblending.linear.spectra import (
     RIDGE,
     nnls_batch,
     portions,

@@ -7,8 +7,8 @@ import pytest
 from helpers.scenes import GALAXIES, SHAPE, blend, frame, observe, sources, truth
 from helpers.start import least_squares, point_of, profiles, rendered, started, view, views
 
+from clresample.deblending.linear.rendered_models import MorphologyModel, render_models
 from clresample.deblending.start.boxes import SMALLEST_RADIUS_PX, box_around, component_box
-from clresample.deblending.start.final_render import MorphologyModel, render_models
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.box import box_slices
 from clresample.sky.sources import ExtendedSource, PointSource

@@ -9,14 +9,14 @@ from helpers.scenes import frame
 from helpers.solver import close, every_type
 from test_boxed_start import view_of
 
-from clresample.deblending.profiles import GalaxyProfile
-from clresample.deblending.start.component_batch import (
+from clresample.deblending.linear.component_batch import (
     ComponentBatch,
     StartComponent,
     listed_by_scene,
     peaks_of,
 )
-from clresample.deblending.start.slot_observation import SlotObservation, smoothed_light
+from clresample.deblending.linear.slot_observation import SlotObservation, smoothed_light
+from clresample.deblending.profiles import GalaxyProfile
 from clresample.device.tuning import Tuning
 from clresample.resampling.plan import Precision
 from clresample.sky.psf import PSF

@@ -6,17 +6,7 @@ import numpy as np
 import pytest
 from helpers.scenes import MODEL_PSF, frame
 
-from clresample.deblending.profiles import (
-    FixedProfile,
-    GalaxyProfile,
-    StarProfile,
-    components_of,
-    draw_psf,
-    galaxy_reach,
-    psf_second_moment,
-)
-from clresample.deblending.spectra import RIDGE, unit_diagonal
-from clresample.deblending.start.component_batch import (
+from clresample.deblending.linear.component_batch import (
     BOX_SIDES,
     ComponentBatch,
     StartComponent,
@@ -26,10 +16,20 @@ from clresample.deblending.start.component_batch import (
     peaks_of,
     profile_thresholds,
 )
-from clresample.deblending.start.equations import _eliminate
-from clresample.deblending.start.final_render import _ImageProfile
+from clresample.deblending.linear.equations import _eliminate
+from clresample.deblending.linear.rendered_models import _ImageProfile
+from clresample.deblending.linear.slot_observation import _pairs
+from clresample.deblending.linear.spectra import RIDGE, unit_diagonal
+from clresample.deblending.profiles import (
+    FixedProfile,
+    GalaxyProfile,
+    StarProfile,
+    components_of,
+    draw_psf,
+    galaxy_reach,
+    psf_second_moment,
+)
 from clresample.deblending.start.profile_start import LIGHT_SIGMAS, _is_dark, profile_peak
-from clresample.deblending.start.slot_observation import _pairs
 from clresample.paper.solver.scene import UNSEEN
 from clresample.sky.sources import ExtendedSource, PointSource
 

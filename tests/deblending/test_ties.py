@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.solver.rendering.ties import Ties, band_equations
-from clresample.deblending.start.equations import _eliminate, _without_levels
+from clresample.deblending.linear.equations import _eliminate, _without_levels
+from clresample.deblending.linear.ties import Ties, band_equations
 
 
 def test_ties_sum_spread_and_average():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.linear.rendered_models import RenderedModel
 from clresample.deblending.profiles import (
     COMPONENT_SPREAD,
     FixedProfile,
@@ -17,8 +18,7 @@ from clresample.deblending.refit.colour_gradient import GradientTest
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.deblending.solver.multiscale.structure import coarse_count
 from clresample.deblending.solver.scene import State, StructureState
-from clresample.deblending.start import final_render
-from clresample.deblending.start.final_render import RenderedModel
+from clresample.deblending.start import first_scene
 from clresample.deblending.start.profile_start import StartingPoint, StartInput
 from clresample.deblending.view import WhitenedView
 from clresample.sky.frame import Frame
@@ -190,12 +190,12 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
             model = np.einsum("ic,icyx->cyx", spectra[:, part], np.asarray(rendered))
             left = view.data - model - (sky + change)[part, None, None]
             chi2[k] += (view.sqrt_weights**2 * left**2).sum()
-    monkeypatch.setattr(final_render, "model_of", lambda one: one.name)
+    monkeypatch.setattr(first_scene, "model_of", lambda one: one.name)
     monkeypatch.setattr(
-        final_render, "render_models", lambda names, fit_sky: [of(skies[k]) for k in names]
+        first_scene, "render_models", lambda names, fit_sky: [of(skies[k]) for k in names]
     )
     others = [fit(k) for k in (2, 0, 1)]  # another scene's
-    best, other = final_render.best_starts([starts, others], True)
+    best, other = first_scene.best_starts([starts, others], True)
     assert best is starts[int(np.argmin(chi2))] and best.name == 1 and other is others[2]
     np.testing.assert_array_equal(best.state.spectra, spectra)
     np.testing.assert_array_equal(best.state.sky, sky + skies[1])

@@ -10,15 +10,15 @@ from helpers.tuning import tune
 
 from clresample.deblending import batch, iterate as iterate_module
 from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.linear import renderer as renderer_module
+from clresample.deblending.linear.component_batch import StartComponent
+from clresample.deblending.linear.linearised_scenes import linearise
+from clresample.deblending.linear.render_planner import _WindowRenderer
+from clresample.deblending.linear.rendered_models import WHOLE_PX, MorphologyModel, render_models
 from clresample.deblending.profiles import StarProfile
 from clresample.deblending.shifts import SCATTER_PX, shift_steps
 from clresample.deblending.solver.scene import Scene, State
-from clresample.deblending.start import renderer as renderer_module
-from clresample.deblending.start.component_batch import StartComponent
-from clresample.deblending.start.final_render import WHOLE_PX, MorphologyModel, render_models
-from clresample.deblending.start.linearised_scenes import linearise
 from clresample.deblending.start.profile_start import PRECISION, TOLERANCE, profile_peak
-from clresample.deblending.start.render_planner import _WindowRenderer
 from clresample.deblending.view import SceneGeometry, whitened_view
 from clresample.paper import run as paper_run
 from clresample.sky.frame import Frame

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clresample.deblending.linear.block_matrix import RIDGE
+from clresample.deblending.linear.normal import SCATTER_PX, UnknownLayout
 from clresample.deblending.posterior import posterior as room
-from clresample.deblending.posterior.block_matrix import RIDGE
-from clresample.deblending.posterior.normal import UnknownLayout
-from clresample.deblending.shifts import SCATTER_PX
 
 from .start import rendered
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from clresample.deblending.linear.spectra import spectrum_covariance
 from clresample.deblending.profiles import FixedProfile
-from clresample.deblending.spectra import spectrum_covariance
 from clresample.deblending.start.profile_start import StartingPoint, StartInput, fit_start_profiles
 from clresample.deblending.view import WhitenedView
 from clresample.resampling.cache import cached_resampler

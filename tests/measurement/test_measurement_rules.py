@@ -6,8 +6,8 @@ from helpers.blends import blend, observe, round_component
 from scipy.signal import fftconvolve
 
 from clresample.deblending.assessment.misfit import Misfit
+from clresample.deblending.linear.spectra import MODEL_ERROR
 from clresample.deblending.posterior.residuals import _filtered, _kernels, convolved
-from clresample.deblending.spectra import MODEL_ERROR
 from clresample.measurement import detection, peaks, searched as searched_module
 from clresample.measurement.detection import detect, detect_more
 from clresample.sky.frame import model_frame

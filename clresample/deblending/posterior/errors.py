@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.blas import strmm
 
-from ..solver.rendering.ties import Ties
-from .block_matrix import RIDGE, BlockCholesky
-from .mode_images import ModeImages, combined
+from ..linear.block_matrix import RIDGE, BlockCholesky
+from ..linear.mode_images import ModeImages, combined
+from ..linear.ties import Ties
 
 # Number of draws for the errors of cutouts, and their seed. Standard deviations have a relative
 # error of 1 / sqrt(2 N) = 0.09; the time is proportional to the number.

@@ -19,12 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..linear.aligned_observation import align_observations
+from ..linear.block_matrix import BlockCholesky, BlockMatrix
+from ..linear.normal import UnknownLayout, normal_matrix
 from ..solver.multiscale.prior import kernel_rows
 from ..view import flush_faint
-from .aligned_observation import align_observations
-from .block_matrix import BlockCholesky, BlockMatrix
 from .modes import Solution
-from .normal import UnknownLayout, normal_matrix
 from .smooth_modes import SmoothModes, whitening_transform
 
 # Sources overlap in a pixel if a neighbour has more than MIN_LIGHT_RATIO of the source's light, and

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg.blas import strmm
 
 from ...sky.box import intersect_boxes
+from ..linear.mode_images import CellImages, ModeImages, cell_sums, subtract, sums_with
 from ..solver.multiscale.prior import MultiscalePrior
 from ..solver.scene import Scene
 from ..view import flush_faint
-from .mode_images import CellImages, ModeImages, cell_sums, subtract, sums_with
 from .profile_modes import profile_modes
 from .smooth_modes import MIN_LIGHT, SmoothModes, whitening_transform
 

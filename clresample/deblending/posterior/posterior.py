@@ -13,15 +13,15 @@ from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.extended import missed_light
 from ..assessment.status import with_misfit_status
 from ..component_images import local_chi2
+from ..linear.aligned_observation import align_observations
+from ..linear.block_matrix import BlockCholesky
+from ..linear.mode_images import ModeImages, sums_with
+from ..linear.normal import UnknownLayout, normal_matrix
 from ..result import noted
-from .aligned_observation import align_observations
-from .block_matrix import BlockCholesky
 from .bound_bias import negative_chi2_gradient
 from .errors import Errors, MorphologyErrors, PosteriorSampler
-from .mode_images import ModeImages, sums_with
 from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
-from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
 from .shared_light import (
     doubted_shapes,

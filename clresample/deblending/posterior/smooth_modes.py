@@ -14,7 +14,7 @@ import functools
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from .mode_images import cell_sums
+from ..linear.mode_images import cell_sums
 
 # [model px] Distance of bumps, whose sigma is half of it. FINE_SPACING_PX is used where a source
 # overlaps a neighbour, because the data hardly constrain the division of light there. In crowded

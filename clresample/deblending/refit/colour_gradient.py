@@ -20,7 +20,7 @@ import numpy as np
 
 from ...sky.sources import ExtendedSource
 from ..component_images import ComponentImages, local_chi2
-from ..start.final_render import model_of, render_models
+from ..linear.rendered_models import model_of, render_models
 
 # Relative scatter of the core's spectrum about that of the whole source: 0.3 mag, as between bulges
 # and discs. With half or twice that, evidences differ by a few; gradients over 3 % are detected in

@@ -17,8 +17,7 @@ from ..ended import Ended
 from ..profiles import COMPONENT_SPREAD, FixedProfile, GalaxyProfile
 from ..solver.multiscale.structure import no_structure
 from ..solver.scene import StructureState
-from ..start.final_render import best_starts
-from ..start.first_scene import first_scene
+from ..start.first_scene import best_starts, first_scene
 from ..start.profile_start import StartInput, fit_start_profiles, profile_peak
 from .colour_gradient import run_gradient_tests
 

@@ -2,5 +2,6 @@
 
 A Scene and its State (scene.py) are uploaded (buffers.py); gradient.py queues the loss and its
 gradients, rendering/ renders the model, and multiscale/ takes the steps and returns States. This
-package does not depend on blends, fits and results. Imports `resampling`, `device` and `sky`.
+package does not depend on blends, fits and results. Imports `linear`, `resampling`, `device` and
+`sky`.
 """

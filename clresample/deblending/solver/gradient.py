@@ -5,7 +5,7 @@
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>
     dsky_c = sum of w_o (...) + p_c sky_c
 
-dA of tied channels is the mean over their band, see rendering/ties.py.
+dA of tied channels is the mean over their band, see linear/ties.py.
 
 The solvers add the prior's term and its gradient in their steps. rendering/ computes
 R_o M and the gradients; kernels are in scene.cl, boxed.cl and losses.cl.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...resampling.resampler import Resampler
-from .rendering.ties import Ties
+from ..linear.ties import Ties
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from ..solver.multiscale.prior import MultiscalePrior, kernel_rows, without_profile
 from ..solver.multiscale.structure import coarse_count, no_structure
 from ..solver.scene import StructureState
-from .final_render import best_starts
+from .first_scene import best_starts
 from .profile_start import by_size
 
 

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..linear.component_batch import renumbered
 from ..profiles import GalaxyProfile
-from .component_batch import renumbered
 from .population import NEIGHBOUR_MODEL_ERROR
 
 # Ratio of successive sizes: least squares converge from half of it.

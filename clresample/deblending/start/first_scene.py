@@ -1,10 +1,16 @@
-"""The initial scene of a fit: the start's profiles in the boxes of their light."""
+"""The initial scene of a fit, and the best of several starts.
+
+A scene has the start's profiles in the boxes of their light.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from ...sky.sources import PointSource
+from ..linear.rendered_models import model_of, render_models
 from ..solver.scene import Scene, State
 from .boxes import component_box
 
@@ -36,3 +42,19 @@ def first_scene(fit) -> tuple[Scene, State]:
         ties=fit.ties,
     )
     return scene, State([m.copy() for m in morphs], begin.spectra, begin.sky)
+
+
+def best_starts(starts, fit_sky):
+    """Selects of each scene's Fits at their starts the one with the lowest chi2.
+
+    All scenes have equally many starts, compared with their best spectra and sky.
+    """
+    fits = [fit for of_scene in starts for fit in of_scene]
+    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    for fit, seen in zip(fits, images, strict=True):
+        residuals = seen.residuals(fit.scene.channels(), fit.views)
+        pairs = zip(fit.views, residuals, strict=True)
+        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
+        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
+    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
+    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]

@@ -6,11 +6,11 @@ from copy import deepcopy
 
 import numpy as np
 
-from ..spectra import MODEL_ERROR, add_diagonal
-from .component_batch import peaks_of, renumbered
-from .equations import N_PARAMETERS, normal_equations
+from ..linear.component_batch import peaks_of, renumbered
+from ..linear.equations import N_PARAMETERS, normal_equations
+from ..linear.linearised_scenes import LinearisedScenes
+from ..linear.spectra import MODEL_ERROR, add_diagonal
 from .first_profiles import GROWTH, NEED, first_profiles
-from .linearised_scenes import LinearisedScenes
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 from .shape_grid import fit_faint_shapes
 from .step_control import StepControl

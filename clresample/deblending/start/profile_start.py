@@ -24,11 +24,11 @@ from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
 from ...sky.sources import PointSource
+from ..linear.component_batch import StartComponent, renumbered
+from ..linear.linearised_scenes import linearise
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..sampled_psf import sampled_psfs
 from ..view import WhitenedView, pixel_noise
-from .component_batch import StartComponent, renumbered
-from .linearised_scenes import linearise
 from .profile_fit import ProfileFit, start_from
 from .star_weights import allow_for_psf_error
 

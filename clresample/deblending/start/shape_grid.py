@@ -24,9 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..linear.component_batch import peaks_of, renumbered
+from ..linear.spectra import MODEL_ERROR
 from ..profiles import GalaxyProfile
-from ..spectra import MODEL_ERROR
-from .component_batch import peaks_of, renumbered
 from .first_profiles import NEED
 from .population import LEARNED
 

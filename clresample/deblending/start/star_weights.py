@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...resampling.plan import Precision
+from ..linear.component_batch import StartComponent
+from ..linear.linearised_scenes import linearise
 from ..profiles import StarProfile
 from ..view import WhitenedView, pixel_noise
-from .component_batch import StartComponent
-from .linearised_scenes import linearise
 
 # [sigma] Stars whose PSF error is below this everywhere do not change the weights.
 MIN_PSF_ERROR_SIGMA = 0.05

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..spectra import solve_in_place
-from .equations import N_PARAMETERS
+from ..linear.equations import N_PARAMETERS
+from ..linear.spectra import solve_in_place
 
 # Damping of the first step relative to the normal matrix's diagonal, its divisor after a step with
 # the promised gain, its factor after a rejected one, and its largest value.

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...deblending.blend import Blend
-from ...deblending.spectra import MODEL_ERROR
-from ...deblending.start.equations import N_PARAMETERS
+from ...deblending.linear.equations import N_PARAMETERS
+from ...deblending.linear.spectra import MODEL_ERROR
 from ...sky.box import Box, box_within
 from ...sky.frame import model_frame
 from ...sky.sources import ExtendedSource, PointSource

@@ -10,8 +10,8 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 
+from ...deblending.linear.equations import N_PARAMETERS
 from ...deblending.solver.scene import ComponentStructure
-from ...deblending.start.equations import N_PARAMETERS
 from ...files.fits import open_fits
 from ...measurement.columns import DEFINITIONS, Columns, definitions
 from ...sky.box import Box

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from ....device.contraction import round_up_columns
+from ...linear.placing import reach_of
 from .stages import BoxTransformRendering, FrameRendering
-from .windows import WindowGroups, WindowRendering, reach_of
+from .windows import WindowGroups, WindowRendering
 
 # Cost of an operation relative to one of a large product: first in a product of the size of a box,
 # whose tiles are cut by the box and whose sums are short; then in a sum over sources or bands,

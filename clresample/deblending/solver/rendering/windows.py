@@ -18,6 +18,7 @@ from ....device.contraction import ImageBatch
 from ....device.rounding import round_up
 from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
+from ...linear.placing import place_windows, reach_of
 from ..boxes import Boxes
 
 # [px] Sides of groups' frames are multiples of this, so that cached tables can be used after boxes
@@ -68,11 +69,6 @@ class WindowGroups:
         return b
 
 
-def reach_of(plan):
-    """Distance [model px] to which the light of a group is followed: the frames' padding."""
-    return max(plan.certificate.wrap_radius_px)
-
-
 class WindowOperator:
     """Renders the frames of `groups` as `op` renders the scenes' own: (G, C, ny, nx) to windows.
 
@@ -92,8 +88,7 @@ class WindowOperator:
         """Moves the windows to the operator's present shift."""
         mapping, small = self.op.plans[0].mapping, self.plan.mapping
         off = mapping.offset + self.op.shift - self._groups.low - small.offset
-        self.low = np.rint(-off @ np.linalg.inv(mapping.matrix).T).astype(int)
-        moves = off + self.low @ mapping.matrix.T
+        self.low, moves = place_windows(off, mapping.matrix[None])
         self._executor.set_transfer([self.plan.shifted(move) for move in moves])
 
     def executor(self):

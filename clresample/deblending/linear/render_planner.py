@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...device.rounding import round_up
-from ...resampling.plan import Precision, ResamplingPlan, make_resampling_plan
-from ...resampling.transfer import light_reach
+from ...resampling.plan import Precision, make_resampling_plan
 from ...sky.mapping import PaddedMapping
+from .placing import place_windows, reach_of
 from .renderer import BoxRenderer
 
 # [model px] Largest departure from an affine mapping within a box, as for frames.
@@ -56,11 +56,11 @@ class RenderPlanner:
         self._plans = list({id(p): p for p in plans}.values())
         at = {id(p): i for i, p in enumerate(self._plans)}
         self._plan = np.array([at[id(p)] for p in plans])  # of each scene, among these
-        layouts = [_layout(p) for p in self._plans]
+        # distorted ones are alone
+        layouts = [id(p) if p.geometry == "distorted" else p.layout for p in self._plans]
         self._layout = np.array([layouts.index(layouts[i]) for i in self._plan])
         self._distorted = np.array([p.geometry == "distorted" for p in plans])
-        self._reach = [_reach(p, tolerance) for p in self._plans]
-        self._inverse = np.array([np.linalg.inv(p.mapping.matrix) for p in plans])
+        self._reach = [reach_of(p, tolerance) for p in self._plans]
         self._renderers: dict[object, _WindowRenderer | BoxRenderer] = {}
 
     def runs(self, slots):
@@ -95,10 +95,9 @@ class RenderPlanner:
         which = np.searchsorted(windows.members, self._plan[scene])
         placed = np.array([self.views[s].mapping.offset + self.views[s].op.shift for s in scene])
         off = placed - origin - windows.offset[which]
-        low = np.rint(-np.einsum("nij,nj->ni", self._inverse[scene], off))
-        moves = off + np.einsum("nij,nj->ni", windows.matrix[which], low)
-        lit = np.concatenate([low, windows.own[which]], axis=1).astype(int)
-        return windows.renderer, which, lit[:, :2] - windows.before[which], lit, moves
+        low, moves = place_windows(off, windows.matrix[which])
+        lit = np.concatenate([low, windows.own[which]], axis=1)
+        return windows.renderer, which, low - windows.before[which], lit, moves
 
     def _windows(self, layout, members, shape):
         """The _Windows of the plans `members` for boxes of a shape, of one size for all scenes."""
@@ -182,21 +181,3 @@ class _WindowRenderer:
         self.matrix = np.array([m.matrix for m in mappings])
         self.before = (np.array(renderer.size) - self.own) // 2
         self.offset = self.offset + np.einsum("nij,nj->ni", self.matrix, self.before)
-
-
-def _layout(plan: ResamplingPlan):
-    """Properties that plans share to be rendered together; distorted ones are alone."""
-    if plan.geometry == "distorted":
-        return id(plan)
-    by_row = None if plan.lines is None else plan.lines.by_row
-    return plan.geometry, plan.axes, plan.n_terms, by_row
-
-
-def _reach(plan, tolerance):
-    """Distance [model px] to which the light of a box is followed.
-
-    Without a tolerance it is the padding of the plan's model.
-    """
-    if not tolerance:
-        return max(plan.certificate.wrap_radius_px)
-    return light_reach(plan.psfs[1], plan.mapping.matrix, tolerance)

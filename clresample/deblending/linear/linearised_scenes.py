@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.tuning import Tuning
-from ..solver.rendering.ties import band_equations
-from ..spectra import nnls_batch, spectrum_covariance
 from .component_batch import ComponentBatch, boxes_of, profile_thresholds
 from .equations import ImageProducts
 from .slot_observation import SlotObservation
+from .spectra import nnls_batch, spectrum_covariance
+from .ties import band_equations
 
 
 def linearise(views, components, precision, tolerance, *, fit_sky) -> LinearisedScenes:

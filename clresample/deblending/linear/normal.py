@@ -17,15 +17,17 @@ import numpy as np
 
 from ...device.multi_device import map_threads
 from ...sky.box import box_slices
-from ..shifts import SCATTER_PX
-from ..solver.rendering.ties import Ties
 from .block_matrix import BlockMatrix
 from .mode_images import interpolation
+from .ties import Ties
 
 # [1] Products of this size and more are summed in float64: in float32 their rounding error would
 # approach the prior's precision of 1. A source of signal to noise 300 has products of 1e5. With
 # 1e6, errors of moments change by up to 3e-3.
 LARGE = 3e5
+# [model px] Prior scatter of a shift. If the data leave a larger uncertainty, the step goes to 0.
+# With a larger value noise would shift observations with hardly any light.
+SCATTER_PX = 2.0
 
 
 @dataclass(frozen=True, eq=False)

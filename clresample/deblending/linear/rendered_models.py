@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -149,22 +149,6 @@ def model_of(fit, which=()):
     spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
     given = source, origin, morphs + cores, spectra, fit.state.sky
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
-
-
-def best_starts(starts, fit_sky):
-    """Selects of each scene's Fits at their starts the one with the lowest chi2.
-
-    All scenes have equally many starts, compared with their best spectra and sky.
-    """
-    fits = [fit for of_scene in starts for fit in of_scene]
-    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
-    for fit, seen in zip(fits, images, strict=True):
-        residuals = seen.residuals(fit.scene.channels(), fit.views)
-        pairs = zip(fit.views, residuals, strict=True)
-        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
-        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
-    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
-    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
 
 
 def _looking(views, components, fit_sky):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..solver.rendering.ties import without_level
-from ..spectra import RIDGE, add_diagonal, portions
+from .spectra import RIDGE, add_diagonal, portions
+from .ties import without_level
 
 # Largest number of parameters of a component; others are padded.
 N_PARAMETERS = 4
