@@ -29,7 +29,7 @@ from ...sky.psf import PSF
 from ...sky.sources import ExtendedSource, PointSource
 from ...sky.varying_psf.field import PSFField
 from .image import SIGMAS_A_FWHM
-from .psf_samples import psf_at
+from .psf_samples import inscribed_radius, psf_at
 from .spoilt import GROW_PX
 from .star_cores import star_cores
 from .star_profile import RadialProfile
@@ -263,7 +263,7 @@ def _rays(data, usable, place, radius):
     """
     corners = np.array([(y, x) for y in (0, data.shape[0] - 1) for x in (0, data.shape[1] - 1)])
     end = int(np.ceil(np.hypot(*(corners - place).T).max())) + 1
-    n_angles = int(np.ceil(2 * np.pi * end))
+    n_angles = 2 * int(np.ceil(np.pi * end))  # even, so that each ray has an opposite one
     angles, radii = np.arange(n_angles) * 2 * np.pi / n_angles, np.arange(end + 1.0)[:, None]
     at = [place[0] + radii * np.sin(angles), place[1] + radii * np.cos(angles)]
     rays = map_coordinates(np.where(usable, data, 0.0), at, order=1, mode="constant")
@@ -276,8 +276,7 @@ def _scale(psf, band, profile, radius):
 
     None if the PSF has no light there.
     """
-    (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
-    end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
+    end = min(radius, inscribed_radius(psf, band))
     if end < 1:
         return None
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
@@ -293,6 +292,10 @@ def _lasting(rest, known, light, first, fwhm):
     light (radii,) [sigma]: the mean
     first: number of the core's last ring, within which the result falls to 0
     """
+    half = rest.shape[1] // 2
+    opposite, opposite_known = np.roll(rest, half, axis=1), np.roll(known, half, axis=1)
+    rest = np.where(known, rest, opposite)
+    known = known | opposite_known
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
     lasting = np.zeros_like(rest)
