@@ -201,7 +201,7 @@ def _without_ghosts(result, found, places, threshold):
     saturated = np.zeros(result.frame.shape)
     points, of_points = _point_sources(result), {}
     for i, o in enumerate(result.observations):
-        own = isinstance(o.psf_field, StarPSFs)
+        own = isinstance(o.psf_field, StarPSFs) and not o.psf_field.keeps_core.all()
         sky = result.sky[result.channel_slices()[i], None, None]
         images = [result.model(i) - sky] if own else [result.source_model(k, i) for k in points]
         if not images:

@@ -15,6 +15,7 @@ from clresample.deblending.start.population import (
     NEIGHBOUR_MODEL_ERROR,
     OWN_LIGHT,
     SCENE_SCATTER,
+    STAR_MODEL_ERROR,
     TAILS,
     PopulationPrior,
     contamination_factors,
@@ -149,7 +150,7 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     light[:, 1] *= 30
     images[:, 2, :20] = 0
     images[:, 0, 20:] = 0  # the first one and the third one have no pixel in common
-    source = np.array([[0, 1, 2]])
+    source, stars = np.array([[0, 1, 2]]), np.zeros((1, 3), bool)
     seen = light[..., None] * images
     normal = np.einsum("cip,cjp->cij", images, images)[None]
     expected = []
@@ -161,14 +162,23 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
         held = OWN_LIGHT * own * (beside @ alike) / beside.sum()
         expected.append(max((others * seen[:, i]).sum() - held, 0) ** 2 / own)
     assert np.count_nonzero(expected) >= 2
-    found = contamination_factors(normal, light[None], source)[0]
+    found = contamination_factors(normal, light[None], source, stars)[0]
     np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
     # components of one source do not doubt each other, and one without light is not doubted
-    np.testing.assert_allclose(contamination_factors(normal, light[None], 0 * source), 1)
+    np.testing.assert_allclose(contamination_factors(normal, light[None], 0 * source, stars), 1)
     apart = np.where(np.eye(3), normal, -1e-20)  # rounding
-    np.testing.assert_allclose(contamination_factors(apart, light[None], source), 1)
-    dark = contamination_factors(normal, light[None] * [1, 0, 1], source)[0]
+    np.testing.assert_allclose(contamination_factors(apart, light[None], source, stars), 1)
+    dark = contamination_factors(normal, light[None] * [1, 0, 1], source, stars)[0]
     assert dark[1] == 1 and (dark[[0, 2]] < found[[0, 2]]).all()
+    # a star beside them counts by the error of a PSF
+    only = np.array([[1.0, 0, 1]])
+    stars[0, 2], less = True, STAR_MODEL_ERROR / NEIGHBOUR_MODEL_ERROR
+    pair = contamination_factors(
+        np.abs(normal), light[None] * only, source, np.zeros_like(stars), 0.0
+    )
+    beside = contamination_factors(np.abs(normal), light[None] * only, source, stars, 0.0)
+    np.testing.assert_allclose(beside[0, 0] - 1, less**2 * (pair[0, 0] - 1))
+    assert beside[0, 2] == pair[0, 2]
 
 
 def test_doubt_holds_a_galaxy_as_if_its_data_said_less():

@@ -26,6 +26,12 @@ def psf_at(psf, band, y, x) -> np.ndarray:
     return along_y @ image @ along_x.T
 
 
+def inscribed_radius(psf, band) -> float:
+    """Radius [px] of the circle about a band's centre one pixel inside the PSF's image."""
+    (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
+    return float(psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
+
+
 @lru_cache(maxsize=32)
 def pair_ratios(psf) -> np.ndarray:
     """Least sum of two opposite neighbours of a pixel, over the pixel's own value: (C, 2) [1].

@@ -14,7 +14,7 @@ from scipy.ndimage import (
 )
 from scipy.optimize import minimize
 
-from .psf_samples import psf_at
+from .psf_samples import inscribed_radius, psf_at
 
 # [FWHM of the PSF] Smallest radius of the largest disc inside the masked pixels of a core: narrower
 # masks are bad columns and cosmic rays.
@@ -178,15 +178,17 @@ def _falls_like(light, ring, place, psf, band, fwhm):
     y, x = np.nonzero(ring)
     away = np.hypot(y - place[0], x - place[1])
     outer = away > np.median(away)
-    radii = np.median(away[~outer]), np.median(away[outer])
+    radii = np.array([np.median(away[~outer]), np.median(away[outer])])
     bright = np.array([np.median(light[ring][part]) for part in (~outer, outer)])
     if not bright[0] > bright[1] > 0:
         return False
+    # beyond the PSF's image, light is compared with that at the same ratio of radii within it
+    inside = radii * min(1.0, inscribed_radius(psf, band) / radii[1])
     angles = np.arange(16) * np.pi / 8
     own = [
         np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
-        for r in radii
+        for r in inside
     ]
-    if not own[0] > own[1] > 0:  # beyond the PSF's image
-        return bright[1] < bright[0]
-    return bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0]
+    if not own[0] > own[1] > 0:
+        return bool(bright[1] < bright[0])
+    return bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])

@@ -55,6 +55,11 @@ class RadialProfile:
             found = found + np.where(outside, slope * (x - u[end]), 0.0)
         return np.exp(found)
 
+    @property
+    def end(self) -> float:
+        """Radius [px] of the outermost ring."""
+        return float(np.exp(self.log_radius[-1]))
+
     def power(self, radius) -> float:
         """Exponent of the power of the distance by which the light falls at a radius [px]."""
         ends = self.at(np.array([1.0, np.exp(LOG_STEP)]) * radius)

@@ -8,7 +8,9 @@ observation, P:
     P_s(r, t) ~ B(r) + G(r, t),    B: median of d over angles,    G: median of d - B along rays
 
 beyond the core and away from the light of listed sources, and a P inside the core, where the mean
-of a P equals B at the rim.
+of a P equals B at the rim. Behind a listed source G is that on the opposite side of the star, as
+spikes and haloes of a mirror are alike there. Of a star with a small core, a P is all that lies
+within the PSF's image, and a that of least squares.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from ...sky.psf import PSF
 from ...sky.sources import ExtendedSource, PointSource
 from ...sky.varying_psf.field import PSFField
 from .image import SIGMAS_A_FWHM
-from .psf_samples import psf_at
+from .psf_samples import inscribed_radius, psf_at
 from .spoilt import GROW_PX
 from .star_cores import star_cores
 from .star_profile import RadialProfile
@@ -66,6 +68,7 @@ class StarPSFs(PSFField):
     psf: PSF at all other places, or field: PSFField of them; places (K, 2) [px] of the stars
     own (K): PSFs of the stars
     flux_error (K, C) [1]: relative flux error of each star, beyond that of the PSF's width
+    keeps_core (K,): bool, stars with the PSF passed and wings of their own beyond its image
     """
 
     psf: PSF
@@ -73,6 +76,7 @@ class StarPSFs(PSFField):
     places: np.ndarray
     own: tuple[PSF, ...]
     flux_error: np.ndarray
+    keeps_core: np.ndarray
 
     @property
     def n_bands(self):
@@ -85,8 +89,10 @@ class StarPSFs(PSFField):
 
     def psf_at(self, y, x):
         star = self.number_at(y, x)
-        if star is not None:
-            return self.own[star]
+        return self.passed_at(y, x) if star is None else self.own[star]
+
+    def passed_at(self, y, x):
+        """The PSF at (y, x) [px] as the user passed it."""
         return self.psf if self.field is None else self.field.psf_at(y, x)
 
 
@@ -94,8 +100,8 @@ def with_star_psfs(image, sources, places, sky):
     """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
 
     The masked pixels of all cores grow by WIDE_GROW_PX, or `spoilt.GROW_PX` for stars with cores
-    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed; see `StarCore.grown`. Without any core
-    the image is returned unchanged.
+    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed within its image and do not count; see
+    `StarCore.grown`. Without any core the image is returned unchanged.
 
     sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
     sky: True if a sky level is fitted
@@ -117,26 +123,24 @@ def with_star_psfs(image, sources, places, sky):
                 wide[c] |= image.usable[c] & core.grown(
                     image.significance[c], image.usable[c], grow
                 )
-                if is_wide:
-                    found.setdefault(i, {})[c] = core
+                found.setdefault(i, {})[c] = core, is_wide
     image = image.without(wide) if wide.any() else image
-    found = {
-        i: {c: _measure_psf(image, c, i, core, sky) for c, core in cores.items()}
-        for i, cores in found.items()
-    }
-    found = {i: {c: p for c, p in own.items() if p is not None} for i, own in found.items()}
+    for i, cores in list(found.items()):
+        own = {c: _measure_psf(image, c, i, *core, sky) for c, core in cores.items()}
+        own = {c: measured for c, measured in own.items() if measured is not None}
+        n_own[i] = sum(cores[c][1] for c in own)
+        found[i] = own
     found = {i: own for i, own in found.items() if own}
     if not found:
         return image, n_own
-    for i, own in found.items():
-        n_own[i] = len(own)
     o, numbers = image.observation, sorted(found)
     psfs = tuple(_combine_psfs(_listed_psf(o, places[i]), found[i]) for i in numbers)
     flux_error = np.zeros((len(numbers), len(wide)))
     for k, i in enumerate(numbers):
         for c, (_, _, part) in found[i].items():
             flux_error[k, c] = part
-    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, flux_error)
+    keeps_core = n_own[numbers] == 0
+    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, flux_error, keeps_core)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_own
 
 
@@ -183,37 +187,42 @@ def _combine_psfs(given, own):
     return PSF.restore(images, spacing=given.spacing, center=centers)
 
 
-def _measure_psf(image, c, i, core, sky):
+def _measure_psf(image, c, i, core, is_wide, sky):
     """Measures the own PSF of star i in channel c: samples, their centre, the flux uncertainty.
 
     The centre (2,) is in samples; for the uncertainty see StarPSFs. None if the star's light does
-    not fall from the core outwards. The samples' sum is 1 less the light left out of the core.
-    i: number of the model's star; core: StarCore; sky: see `with_star_psfs`
+    not fall from the core outwards, or that of a small core ends within the PSF's image. The
+    samples' sum is 1 less the light left out of a wide core.
+    i: number of the model's star; core: StarCore; is_wide, sky: see `with_star_psfs`
     """
     o, fwhm, place = image.observation, float(image.observation.psf.fwhm_px[c]), image.places[i]
     psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
+    middle = core.place if is_wide else place
     # the fit has no sky level, or a fitted one
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
-    radius = core.radius + WIDE_GROW_PX
-    away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])
-    beside = image.usable[c] & (away >= radius)
+    radius = core.radius + WIDE_GROW_PX if is_wide else inscribed_radius(psf, c)
+    away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
+    beside = image.usable[c] & (away >= (radius if is_wide else radius - fwhm))
     profile = RadialProfile.measure(data, beside, away, image.sigma[c])
     if profile is None:
         return None
     others = np.delete(image.places, i, axis=0)[np.delete(image.inside, i)]
     rest = (data - profile.at(away)) / image.sigma[c]
-    free = ~_near_sources(rest, image.usable[c], others, core.place, fwhm)
+    free = ~_near_sources(rest, image.usable[c], others, middle, fwhm)
     profile = RadialProfile.measure(data, beside & free, away, image.sigma[c]) or profile
-    scale = _scale(psf, c, profile, radius)
-    if not scale:
+    if is_wide:
+        scale = _scale(psf, c, profile, radius)
+    else:
+        scale = _amplitude(psf, c, data, image.usable[c] & free & (away < radius), middle)
+    if not scale or (not is_wide and profile.end < radius):
         return None
     rest, free = data - profile.at(away), image.usable[c] & free
-    rays, known = _rays(rest, free, core.place, radius)
+    rays, known = _rays(rest, free, middle, radius)
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, known, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image
-    step, low = psf.spacing, -core.place
-    high = np.array([n_y - 1, n_x - 1]) - core.place
+    step, low = psf.spacing, -middle
+    high = np.array([n_y - 1, n_x - 1]) - middle
     y, x = (
         np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step
         for a, b in zip(low, high, strict=True)
@@ -221,14 +230,17 @@ def _measure_psf(image, c, i, core, sky):
     away, turn = np.hypot(y[:, None], x), np.arctan2(y[:, None], x) / (2 * np.pi)
     n_angles = lasting.shape[1] - 1
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
+    more = _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
-    mean, more = profile.at(away), _smooth(more, fwhm / SIGMAS_A_FWHM / step)
-    total = (taken * scale * _within_image(psf, c, y, x) + (1 - taken) * mean + more).sum()
-    own = profile.with_core(away, radius) + more
+    whole = taken * scale * _within_image(psf, c, y, x) + (1 - taken) * profile.at(away) + more
+    total = whole.sum()
     if not total > 0:
         return None
-    # the model's star lies at `place`, its light about the core's
-    centre = np.array([-y[0], -x[0]]) / step + (place - core.place) / step
+    # the model's star lies at `place`, its light about the middle
+    centre = np.array([-y[0], -x[0]]) / step + (place - middle) / step
+    if not is_wide:
+        return whole / total, centre, 0.0
+    own = profile.with_core(away, radius) + more
     return own / total, centre, abs(profile.power(radius) - 2)
 
 
@@ -263,7 +275,7 @@ def _rays(data, usable, place, radius):
     """
     corners = np.array([(y, x) for y in (0, data.shape[0] - 1) for x in (0, data.shape[1] - 1)])
     end = int(np.ceil(np.hypot(*(corners - place).T).max())) + 1
-    n_angles = int(np.ceil(2 * np.pi * end))
+    n_angles = 2 * int(np.ceil(np.pi * end))  # even, so that each ray has an opposite one
     angles, radii = np.arange(n_angles) * 2 * np.pi / n_angles, np.arange(end + 1.0)[:, None]
     at = [place[0] + radii * np.sin(angles), place[1] + radii * np.cos(angles)]
     rays = map_coordinates(np.where(usable, data, 0.0), at, order=1, mode="constant")
@@ -276,14 +288,27 @@ def _scale(psf, band, profile, radius):
 
     None if the PSF has no light there.
     """
-    (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
-    end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
+    end = min(radius, inscribed_radius(psf, band))
     if end < 1:
         return None
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
     places = [([end * np.sin(t)], [end * np.cos(t)]) for t in angles]
     ring = np.mean([psf_at(psf, band, y, x)[0, 0] for y, x in places])
     return float(profile.at(end)) / ring if ring > 0 else None
+
+
+def _amplitude(psf, band, data, chosen, place):
+    """Factor that scales a PSF about a place (2,) [px] to the chosen pixels (My, Mx) of data.
+
+    None if the PSF has no light there.
+    """
+    y, x = np.nonzero(chosen)
+    if not len(y):
+        return None
+    ys, xs = np.arange(y.min(), y.max() + 1), np.arange(x.min(), x.max() + 1)
+    light = psf_at(psf, band, ys - place[0], xs - place[1])[y - ys[0], x - xs[0]]
+    power = light @ light
+    return float(light @ data[chosen] / power) if power > 0 else None
 
 
 def _lasting(rest, known, light, first, fwhm):
@@ -293,6 +318,10 @@ def _lasting(rest, known, light, first, fwhm):
     light (radii,) [sigma]: the mean
     first: number of the core's last ring, within which the result falls to 0
     """
+    half = rest.shape[1] // 2
+    opposite, opposite_known = np.roll(rest, half, axis=1), np.roll(known, half, axis=1)
+    rest = np.where(known, rest, opposite)
+    known = known | opposite_known
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
     lasting = np.zeros_like(rest)

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.box import intersect_boxes
-from ..profiles import GalaxyProfile
+from ..profiles import GalaxyProfile, StarProfile
 from ..solver.multiscale.prior import without_profile
 from ..start.population import contamination_factors
 from .errors import FluxChanges
@@ -120,7 +120,9 @@ def _contamination(posterior):
             shared = block[layout.n_modes[i] + bands, layout.n_modes[j] + bands]
             normal[0, :, i, j] = normal[0, :, j, i] = shared
     spectra = solution.spectra if layout.ties is None else solution.spectra[:, layout.ties.first]
-    return contamination_factors(normal, spectra.T[None], np.asarray(solution.source)[None])[0]
+    stars = np.array([isinstance(shape, StarProfile) for shape in solution.shapes])
+    source = np.asarray(solution.source)
+    return contamination_factors(normal, spectra.T[None], source[None], stars[None])[0]
 
 
 def exchanged_light(result, solution, shapes) -> np.ndarray:

@@ -219,8 +219,9 @@ class ProfileFit:
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        given = normal, spectra, self.source[scenes], self.population.own_light[scenes]
-        self.population.set_contamination(scenes, contamination_factors(*given))
+        prior, source = self.population, self.source[scenes]
+        given = normal, spectra, source, prior.stars[scenes], prior.own_light[scenes]
+        prior.set_contamination(scenes, contamination_factors(*given))
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some of the scenes rendered last."""
