@@ -21,7 +21,7 @@ PATCH_COLUMNS = definitions(
     {
         "fit_id": ("number of the fit", None, np.int64),
         "parent_id": ("id of the brightest source detected in the blend", None, np.int64),
-        "n_refits": ("how often a piece of a cut blend was fitted again", None, np.int64),
+        "n_refits": ("last round in which a piece of a cut blend was fitted again", None, np.int64),
         "status": ("how the fit ended", None, "U"),
         "n_sources": ("that were fitted together", None, np.int64),
         "n_pixels": ("of the model, about the blend", None, np.int64),
