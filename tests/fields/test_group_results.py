@@ -100,8 +100,10 @@ def test_profiles_come_back_digit_by_digit_of_the_patches_asked_for(part, tmp_pa
     for number, patch, theta in (*rows, (14, replace(PATCH, number=8), one)):
         part.add_component(number, patch, np.zeros(2), np.ones((2, 3)), np.ones(2), theta)
     file, _ = read(part, tmp_path)
-    assert file.profiles({7}) == {11: (one, one[::-1]), 12: (star,), 13: ((),)}
-    assert file.profiles({8}) == {14: (one,)} and file.profiles(()) == {}
+    found = file.last_fits({7: (0, 0), 8: (0, 0), 9: (0, 0)})
+    profiles = {patch: own for patch, (own, _) in found.items()}
+    of_7 = {11: (one, one[::-1]), 12: (star,), 13: ((),)}
+    assert profiles == {7: of_7, 8: {14: (one,)}, 9: {}} and file.last_fits({}) == {}
 
 
 def test_structure_comes_back_of_the_patch_asked_for(part, tmp_path):
@@ -123,20 +125,19 @@ def test_structure_comes_back_of_the_patch_asked_for(part, tmp_path):
         origin = np.array([30, 40]) + (own or one).origin
         part.add_component(number, patch, origin, np.ones((2, 3)), np.ones(2), (), own)
     file, _ = read(part, tmp_path)
-    found = file.structures(7, (30, 40))
+    ((_, found),) = file.last_fits({7: (30, 40)}).values()
     assert list(found) == [11, 12] and found[12] == (None,)
     for back, own in zip(found[11], (one, two), strict=True):
         assert back.origin == own.origin and back.clear is own.clear
         np.testing.assert_array_equal(back.strengths, own.strengths)
         for z, wanted in zip(back.coefficients, own.coefficients, strict=True):
             np.testing.assert_array_equal(z, wanted.astype(np.float32))
-    assert file.structures(9, (0, 0)) == {}
 
 
 def test_an_empty_part_is_a_file_too(tmp_path):
     file, _ = read(GroupResults(), tmp_path)
     assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
-    assert list(file.models()) == [] and file.profiles({7}) == {} == file.structures(7, (0, 0))
+    assert list(file.models()) == [] and file.last_fits({7: (0, 0)}) == {7: ({}, {})}
 
 
 def test_files_are_fits_as_others_see_them(part, tmp_path):

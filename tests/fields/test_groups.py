@@ -10,14 +10,16 @@ from clresample.deblending.settings import Settings
 from clresample.fields.blends.cut import FitLimits, cut_blend
 from clresample.fields.blends.plan import host_ids, source_ids
 from clresample.fields.blends.tiles import SearchTile
-from clresample.fields.execution import fitting
+from clresample.fields.execution import fitting, rounds
 from clresample.fields.execution.fitting import LARGE, _settings, is_large
-from clresample.fields.execution.group_results import GroupResults, GroupResultsFile
+from clresample.fields.execution.group_results import FOUND_COLUMNS, GroupResults, GroupResultsFile
 from clresample.fields.execution.rounds import _PieceHistory
 from clresample.fields.execution.searching import _lost
 from clresample.paper.settings import PaperSettings
 from clresample.sky.box import Box
 from clresample.sky.sources import ExtendedSource
+
+EMPTY = np.zeros(0)
 
 
 def chain(saddle, n=4):
@@ -85,6 +87,42 @@ def test_a_piece_moves_by_errors_and_by_part_of_its_flux(monkeypatch, flux, erro
         lambda pairs: {1: (3, np.array([flux[pairs[0][1] == "second"]]), np.array([error]))},
     )
     assert parts.moved({3}) == ({3} if moves else set())
+
+
+@pytest.mark.parametrize(
+    ("moves", "fitted", "unsettled"),
+    [
+        ([{0, 2}, {1}, set()], [{0, 2}, {1}, {2}], set()),
+        ([{0, 2}, set()], [{0, 2}, {1}], set()),
+        ([set(), {1}, {2}, {1, 2}], [{0, 2}, {1}, {2}, {1}, {2}, {1}, {2}, {1}], {70}),
+        ([{0, 1, 2}], [{0, 2}, {1}, {2}, {1}, {2}, {1}, {2}, {1}], {70}),
+    ],
+)
+def test_pieces_beside_a_large_one_wait_for_its_last_fit(
+    monkeypatch, tmp_path, moves, fitted, unsettled
+):
+    """Piece 0 is large and beside 1, which is beside 2; the last of `moves` repeats."""
+    siblings = ((1,), (0, 2), (1,))
+    patches = [SimpleNamespace(siblings=own, pieces=3, parent=70) for own in siblings]
+    plan = SimpleNamespace(patches=patches, groups=((0, 1, 2),), cut_groups=((0,), (1, 2)))
+    done, left = [], list(moves)
+
+    def moved(self, pieces):
+        return pieces & (left.pop(0) if len(left) > 1 else left[0])
+
+    def fit_round(_job, tasks, _engine, _progress):
+        done.append({n for task in tasks for n in task.patches})
+        assert all(n != 0 or task.round < 2 for task in tasks for n in task.patches)
+        return {task.name: task.patches for task in tasks}
+
+    monkeypatch.setattr(rounds, "_fit_round", fit_round)
+    monkeypatch.setattr(rounds, "_is_large", lambda _job, n: n == 0)
+    monkeypatch.setattr(_PieceHistory, "moved", moved)
+    monkeypatch.setattr(GroupResultsFile, "read", lambda *_: [dict.fromkeys(FOUND_COLUMNS, EMPTY)])
+    job = SimpleNamespace(plan=plan, folder=tmp_path)
+    progress = SimpleNamespace(stage=lambda *_: None)
+    _, found = rounds.fit_all_groups(job, None, progress)
+    assert done[1:] == fitted and found == unsettled
 
 
 def test_a_large_piece_has_many_pixels_times_sources():

@@ -58,10 +58,12 @@ def gather_inputs(job, group) -> GroupInputs:
         there = Box(box.y0 - y, box.x0 - x, box.y1 - y, box.x1 - x).intersection(region)
         corner = there.y0 + y, there.x0 + x
         labels[number] = corner, np.array(whole[there.slices])
-    before = {}
+    of_file: dict[str, dict] = {}
     for number, name in group.last_fits:
-        file, box = GroupResultsFile(job.folder / f"{name}.fits"), job.plan.patches[number].box
-        before[number] = file.profiles({number}), file.structures(number, box[:2])
+        of_file.setdefault(name, {})[number] = job.plan.patches[number].box[:2]
+    before = {}
+    for name, corners in of_file.items():
+        before |= GroupResultsFile(job.folder / f"{name}.fits").last_fits(corners)
     return GroupInputs(labels, None if group.round == 0 else _light(job, group), before)
 
 

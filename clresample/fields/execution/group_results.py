@@ -21,7 +21,7 @@ PATCH_COLUMNS = definitions(
     {
         "fit_id": ("number of the fit", None, np.int64),
         "parent_id": ("id of the brightest source detected in the blend", None, np.int64),
-        "n_refits": ("how often a piece of a cut blend was fitted again", None, np.int64),
+        "n_refits": ("last round in which a piece of a cut blend was fitted again", None, np.int64),
         "status": ("how the fit ended", None, "U"),
         "n_sources": ("that were fitted together", None, np.int64),
         "n_pixels": ("of the model, about the blend", None, np.int64),
@@ -180,41 +180,38 @@ class GroupResultsFile:
         """(id of the source, patch) of each component."""
         return _owners(*self.read("COMPONENTS"))
 
-    def profiles(self, chosen) -> dict[int, tuple[tuple[float, ...], ...]]:
-        """Parameters {id: (n,) of each component} of the sources of the patches in `chosen`."""
-        found: dict[int, tuple] = {}
-        table, thetas = self.read("COMPONENTS", "THETAS")
-        for (source, patch), theta in zip(_owners(table), thetas, strict=True):
-            if patch in chosen:
-                own = tuple(theta[np.isfinite(theta)].tolist())
-                found[source] = (*found.get(source, ()), own)
-        return found
+    def last_fits(self, corners) -> dict[int, tuple[dict, dict]]:
+        """Profiles and structures of some patches' sources, {patch: (profiles, structures)}.
 
-    def structures(self, patch, corner) -> dict[int, tuple]:
-        """ComponentStructures {id: of each component} of a patch's sources, None for those without.
+        Profiles {id: parameters (n,) of each component}; structures {id: ComponentStructure of
+        each component}, None for those without
 
-        corner (2,) [px]: first pixel of the patch's frame in the field's model pixels
+        corners {patch: (2,) [px]}: first pixel of its frame in the field's model pixels
         """
-        table, scales, strengths, flat = self.read(
-            "COMPONENTS", "SCALES", "STRENGTHS", "COEFFICIENTS"
-        )
-        rows = np.stack([scales[name] for name in SCALE_COLUMNS], axis=1)
-        ends = np.cumsum(rows[:, 1] * rows[:, 2])
-        places = np.stack([table["y0"], table["x0"]], axis=1) - np.array(corner)
-        found: dict[int, tuple] = {}
-        for i, (source, number) in enumerate(_owners(table)):
-            if number == patch:
+        found: dict[int, tuple[dict, dict]] = {patch: ({}, {}) for patch in corners}
+        with open_fits(self.path) as hdus:
+            table, scales = _columns(hdus["COMPONENTS"]), _columns(hdus["SCALES"])
+            thetas, strengths = _array(hdus["THETAS"]), _array(hdus["STRENGTHS"])
+            rows = np.stack([scales[name] for name in SCALE_COLUMNS], axis=1)
+            ends, flat = np.cumsum(rows[:, 1] * rows[:, 2]), hdus["COEFFICIENTS"]
+            places = np.stack([table["y0"], table["x0"]], axis=1)
+            for i, (source, patch) in enumerate(_owners(table)):
+                if patch not in found:
+                    continue
                 own, one = np.flatnonzero(rows[:, 0] == i), None
                 if len(own):
-                    parts = (flat[ends[k] - rows[k, 1:3].prod() : ends[k]] for k in own)
-                    pairs = zip(parts, rows[own, 1:3], strict=True)
+                    start = int(ends[own[0]] - rows[own[0], 1:3].prod())
+                    z = np.array(flat.section[start : int(ends[own[-1]])], np.float32)
+                    parts = np.split(z, ends[own[:-1]] - start)
                     one = ComponentStructure(
-                        tuple(places[i].tolist()),
-                        tuple(part.reshape(shape) for part, shape in pairs),
+                        tuple((places[i] - corners[patch]).tolist()),
+                        tuple(z.reshape(k[1:3]) for z, k in zip(parts, rows[own], strict=True)),
                         strengths[own],
                         bool(rows[own[0], 3]),
                     )
-                found[source] = (*found.get(source, ()), one)
+                theta = tuple(thetas[i][np.isfinite(thetas[i])].tolist())
+                for of_source, value in zip(found[patch], (theta, one), strict=True):
+                    of_source[source] = (*of_source.get(source, ()), value)
         return found
 
     def offsets(self) -> np.ndarray:

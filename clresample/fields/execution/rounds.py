@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import replace
 
@@ -46,7 +47,8 @@ def fit_all_groups(job, engine, progress):
     """Fits all groups that are not on disk yet, round by round.
 
     A cut blend's pieces are fitted again with the new sources of their residuals, and then as long
-    as the fluxes of a neighbour change.
+    as the fluxes of a neighbour change. Those beside large pieces wait until these are fitted again
+    for the last time, since their rough fits' light would only be replaced.
     returns the GroupResultsFiles, of which the last round of each patch is valid, and the parents
         of the cut blends whose pieces had not settled when the rounds ended
     """
@@ -58,9 +60,8 @@ def fit_all_groups(job, engine, progress):
     pieces = {n for group in job.plan.cut_groups for n in group}
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
-    n_last = 0
-    for n_round in range(1, ROUNDS + 1):
-        again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
+    for n_round in itertools.count(1):
+        again = _without_waiting(job, {n for n in pending if history.may_change(n)})
         groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
@@ -78,15 +79,20 @@ def fit_all_groups(job, engine, progress):
         ]
         names = _fit_round(job, tasks, engine, progress)
         history.add(names)
-        moved = history.moved({n for patches in names.values() for n in patches})
-        pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
+        moved = history.moved(again)
+        pending -= again  # the others wait
+        pending |= {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
         parts += names
-        n_last = n_round
-    # the first round follows rough fits, with which fluxes cannot be compared
-    judged = moved if pending and n_last > 1 else ()
-    unsettled = {job.plan.patches[n].parent for n in judged}
+    # a piece's second fit follows a rough one, with which its fluxes cannot be compared
+    unsettled = {job.plan.patches[n].parent for n in moved if len(history.names[n]) > 2}
     # sorted by name, so that sums of models do not depend on the order in which the groups ended
     return [_file(job, name) for name in sorted(parts)], unsettled
+
+
+def _without_waiting(job, pending):
+    """The pieces among those that are due which do not wait for a large one beside them."""
+    large = {n for n in pending if _is_large(job, n)}
+    return {n for n in pending if n in large or not large & set(job.plan.patches[n].siblings)}
 
 
 def _is_large(job, number):
@@ -118,6 +124,11 @@ class _PieceHistory:
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
+
+    def may_change(self, patch):
+        """Returns True if a piece may be fitted again."""
+        most = LARGE_ROUNDS if _is_large(self.job, patch) else ROUNDS
+        return len(self.names[patch]) <= most
 
     def light_about(self, patches):
         """`FitGroup.neighbour_models` of some pieces: all their neighbours' last models.
