@@ -7,13 +7,14 @@
  *   plan      (B, 3) int, see lbfgs.cl: blocks of idle scenes are skipped
  *
  * apply_block_inverse  H y and H P g_new by blocks, which share no variable; written over the old
- *           values or, with `more`, added to them; launch: (WG, n blocks), groups of (WG, 1)
+ *           values or, with `more`, added to them; launch: (WG n blocks,), a group a block, on
+ *           the first axis because GPUs limit the groups along other axes
  *
  * Directions d of few variables add d d^T to these inverses, a variable's terms in their order.
  *   owner     (m,) int: the scene of each direction;  totals (m, 2): d . y and d . P g_new
  * direction_products  totals, 0 of idle scenes; ends (m + 1,) int: first of each direction's
  *           elements, then the number of all;  places (k,) int and d (k,): the elements' variables
- *           and values;  launch: (WG, m), groups of (WG, 1)
+ *           and values;  launch: (WG m,), a group a direction
  * add_directions  the directions' terms added to H y and H P g_new, variable by variable:
  *           variables (n,) int, first (n + 1,) int: of their elements, then the number of all;
  *           of (k,) int and values (k,): the elements' directions and values;  launch: FOR_I over n
@@ -46,7 +47,7 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
 #else
     __local REAL row_y[WG], row_p[WG];
 #endif
-    const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
+    const int lid = (int)get_local_id(0), block = (int)get_group_id(0);
     /* an idle scene has no variables here: PoCL crashes if a group returns before this SYNC */
     const int b = blocks[4 * block], m = plan[3 * b] == REST ? 0 : blocks[4 * block + 1];
     __global const int *index = indices + blocks[4 * block + 2];
@@ -162,7 +163,7 @@ void direction_products(__global const int *restrict owner, __global const int *
             __global const REAL *restrict projected, __global REAL *restrict totals)
 {
     __local REAL share[2 * WG];
-    const int lid = (int)get_local_id(0), k = (int)get_global_id(1);
+    const int lid = (int)get_local_id(0), k = (int)get_group_id(0);
     /* idle scenes: none, as above */
     const int end = plan[3 * owner[k]] == REST ? 0 : ends[k + 1];
     REAL total[2] = {0, 0};

@@ -1,6 +1,7 @@
 """Fits that go on from the structure of an earlier fit of the same sources."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,13 @@ from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.iterate import iterate
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.deblending.solver.multiscale.structure import coarse_count
-from clresample.deblending.solver.scene import ComponentStructure
-from clresample.deblending.start.carried_structure import morphology, moved_structure
+from clresample.deblending.solver.scene import ComponentStructure, State
+from clresample.deblending.start.carried_structure import (
+    _of_components,
+    _with_structure,
+    morphology,
+    moved_structure,
+)
 
 PRIOR = MultiscalePrior()
 GALAXY = (22.0, 24.0), (1800, 1600, 1400), 3.5
@@ -55,6 +61,36 @@ def test_structure_moves_with_its_pixels(move, atol):
     inside[origin[0] : 70, origin[1] : 78] = True
     inside[:36, :] = inside[:, :42] = False
     assert abs(found - wanted)[inside].max() < atol * wanted.max()
+
+
+def test_structure_is_for_the_component_that_had_it():
+    """Of a source's two components by their size; a star's has none, others start from nothing."""
+    z = tuple(np.full((8 // step, 8 // step), 0.01) for step in PRIOR.steps)
+    names = [
+        ComponentStructure((0, 0), z, np.full(3, strength), clear)
+        for strength, clear in ((2.0, True), (3.0, False))
+    ]
+    profile, small, large = np.ones((8, 8)), np.array([0.5, 0, 0, 1]), np.array([2.0, 0, 0, 0])
+    fit = SimpleNamespace(
+        start=SimpleNamespace(source=np.array([0, 1, 1, 2])),
+        fitted=np.array([0, 2, 3]),
+        settings=SimpleNamespace(prior=PRIOR),
+        blend=SimpleNamespace(
+            structures=((names[0],), (), tuple(names), ()),
+            thetas=((small,), (), (large, small), (small,)),
+        ),
+        scene=SimpleNamespace(
+            fixed=np.array([True, False, False, False]),
+            profile=[profile] * 4,
+            origin=np.zeros((4, 2)),
+        ),
+        state=State([profile] * 4, None, None),
+    )
+    known = _of_components(fit)
+    assert list(known.items()) == [(1, names[1]), (2, names[0])]
+    learned = _with_structure(fit, known).learned
+    assert learned.clear.tolist() == [False, False, True, False]
+    assert learned.strengths[:, 0].tolist() == [PRIOR.strengths[0], 3, 2, PRIOR.strengths[0]]
 
 
 @pytest.fixture(scope="module")

@@ -92,6 +92,17 @@ def test_a_faint_galaxy_beside_known_ones_changes_nothing_and_among_faint_ones_i
     assert 1.5 * few[0] < more[0] < 0.4
 
 
+def test_galaxies_that_scatter_as_expected_leave_the_scatter_as_it_is():
+    """However well each is known: those of half of the information count a quarter, in the sum and
+    in their number."""
+    variance = np.array([0.1, 0.1, 0.7, 0.7])[:, None] * GALAXY_SCATTER**2
+    off = np.sqrt(GALAXY_SCATTER**2 - variance) * np.array([1, -1, 1, -1])[:, None]
+    given = off[None], variance[None], np.ones((1, 4), bool)
+    common, own, _ = em_step(*given, np.zeros((1, 2)), GALAXY_SCATTER[None])
+    np.testing.assert_allclose(common, 0, atol=1e-12)
+    np.testing.assert_allclose(own, GALAXY_SCATTER[None], rtol=1e-12)
+
+
 def test_only_whole_galaxies_of_scenes_with_several_are_learned_from():
     home = frame()
     scenes = (

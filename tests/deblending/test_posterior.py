@@ -10,7 +10,8 @@ from helpers.scenes import BRIGHT, blend
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.inspection.inspect import InputWarning
-from clresample.deblending.linear import aligned_observation, posterior
+from clresample.deblending.linear import aligned_observation
+from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.moments import moment_derivatives
 from clresample.deblending.settings import Settings
 from clresample.files import results as store
@@ -51,9 +52,15 @@ def test_the_error_of_a_lone_source_is_the_dense_one(device, monkeypatch):
 
 
 def test_blended_sources_exchange_light(device, monkeypatch):
+    shapes, given, exchanged = {}, [], posterior.exchanged_light
+    monkeypatch.setattr(posterior, "doubted_shapes", lambda _: shapes)
+    monkeypatch.setattr(
+        posterior, "exchanged_light", lambda *own: given.append(own[2]) or exchanged(*own)
+    )
     monkeypatch.setattr(posterior, "with_shared_light", lambda errors, *_: errors)
     kept = capture(monkeypatch)
     result = scenes.fit(blend(PAIR), device, settings=BARE)
+    assert given[0] is shapes  # light is searched for where it would be if these are wrong
     for i in (0, 1):
         ratio = errors(result)[i] / dense_error(kept[0], i)
         assert (ratio < 1.005).all() and (ratio > 0.85).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .spectra import RIDGE, add_diagonal, portions
+from .spectra import RIDGE, add_diagonal, portions, solve_free
 from .ties import without_level
 
 # Largest number of parameters of a component; others are padded.
@@ -123,9 +123,8 @@ def _eliminate(normal, right, inner, cross, rest, lit):
     k, n_channels, m, n, p = cross.shape
     cross, rest = cross.reshape(k, n_channels, m, n * p), rest * lit
     cross *= lit[..., None]
-    inner = inner * lit[..., None] * lit[..., None, :]
-    add_diagonal(inner, RIDGE * np.trace(inner, axis1=2, axis2=3)[..., None] + ~lit)
-    solved = np.linalg.solve(inner, cross)
+    power = np.einsum("kcii,kci->kc", inner, lit)
+    solved = solve_free(add_diagonal(inner, RIDGE * power[..., None]), cross, lit)
     for c in range(n_channels):
         _subtract_product(normal, cross[:, c], solved[:, c])
     right -= np.einsum("kcmp,kcm->kp", solved, rest).reshape(right.shape)

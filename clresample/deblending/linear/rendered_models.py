@@ -141,12 +141,17 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
 
 
 def model_of(fit, which=()):
-    """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
+    """All morphologies of a fit, and after them the cores of the components `which` (k,), if any.
+
+    Only with cores the model has the fit's spectra, about which products are asked for.
+    """
     scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
     cores = [morphs[i] * scene.profile[i] for i in which]
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
-    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
+    spectra = None
+    if len(which):
+        spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
     given = source, origin, morphs + cores, spectra, fit.state.sky
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 

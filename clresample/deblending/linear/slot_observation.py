@@ -165,38 +165,28 @@ class SlotObservation:
         K = n_images, of which images that a slot does not have repeat its last. pairs: a table on
         the device
         """
-        out = self.device.empty((len(pairs), self.n_bands, n_images, n_images), self.dtype)
-        if len(pairs):
-            group = self.tuning.sum_group
+        return self._sums("gram", len(pairs), (n_images, n_images), pairs=pairs)
+
+    def residual_products(self, n_images):
+        """Products (slots, Co, K, 2) of the slots' images with the residual, and with the root."""
+        given = {"residual": self.residual, "root": self.root}
+        return self._sums("residual_products", len(self.place), (n_images, 2), **given)
+
+    def _sums(self, name, n, shape, **given):
+        """Sums (n, Co, *shape) over pixels by a kernel of start.cl, in a group each."""
+        out, group = self.device.empty((n, self.n_bands, *shape), self.dtype), self.tuning.sum_group
+        if n:
             self._launch(
-                "gram",
-                (group * len(pairs), self.n_bands),
+                name,
+                (group * n, self.n_bands),
                 local_size=(group, 1),
-                K=n_images,
-                pairs=pairs,
+                K=shape[0],
                 place=self.place_on_device,
                 images=self.seen,
                 weight=self.weight,
                 out=out,
+                **given,
             )
-        return self.device.get(out).astype(np.float64)
-
-    def residual_products(self, n_images):
-        """Products (slots, Co, K, 2) of the slots' images with the residual, and with the root."""
-        group, n = self.tuning.sum_group, len(self.place)
-        out = self.device.empty((n, self.n_bands, n_images, 2), self.dtype)
-        self._launch(
-            "residual_products",
-            (group * n, self.n_bands),
-            local_size=(group, 1),
-            K=n_images,
-            place=self.place_on_device,
-            images=self.seen,
-            weight=self.weight,
-            residual=self.residual,
-            root=self.root,
-            out=out,
-        )
         return self.device.get(out).astype(np.float64)
 
 

@@ -50,6 +50,15 @@ def solve_in_place(matrix, right):
     return x
 
 
+def solve_free(matrix, right, free):
+    """x (..., n, r) of matrices (..., n, n) with the unknowns that are not free (..., n) at 0.
+
+    right (..., n, r): 0 for these
+    """
+    both = free[..., :, None] & free[..., None, :]
+    return np.linalg.solve(add_diagonal(np.where(both, matrix, 0), ~free), right)
+
+
 def portions(n, n_bytes):
     """Slices of n items of `n_bytes` each that have PORTION_BYTES together, or one item."""
     step = max(1, PORTION_BYTES // max(n_bytes, 1))
@@ -81,7 +90,7 @@ def _nnls(normal, right):
     going = np.arange(n_problems)
     for _ in range(SPECTRUM_ITERATIONS):
         on = off[going]
-        found = np.linalg.solve(_masked(matrix[going], on), (right[going] * on)[..., None])[..., 0]
+        found = solve_free(matrix[going], (right[going] * on)[..., None], on)[..., 0]
         slope = np.einsum("mij,mj->mi", matrix[going], found) - right[going]
         wrong = np.where(on, found < 0, slope < -rounding[going])
         x[going] = np.where(on, found, 0)
@@ -133,9 +142,3 @@ def _inverses(normal):
     out = out / scale[..., None] / scale[..., None, :]
     out *= seen[..., None] & seen[..., None, :]
     return add_diagonal(out, np.where(seen, 0, np.inf))
-
-
-def _masked(matrix, on):
-    """Matrices (M, n, n) with only the unknowns `on` (M, n); the others are 0 by 1 x = 0."""
-    both = on[:, :, None] & on[:, None, :]
-    return add_diagonal(np.where(both, matrix, 0), ~on)

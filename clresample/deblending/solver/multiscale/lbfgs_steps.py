@@ -55,11 +55,11 @@ class LbfgsSteps:
         products = {"plan": self._plan, "y": y, "projected": projected}
         added = {"plan": self._plan, "size": v.size, "ring_hy": v.hy, "hg_new": hg_new}
         self._invert, self._multiply_directions, self._add_directions = (
-            b.launcher("block_inverse.cl", name, n_axes, local_size=size, **macros).bind(**given)
-            for name, n_axes, size, given in (
-                ("apply_block_inverse", 2, (group, 1), products | added),
-                ("direction_products", 2, (group, 1), products),
-                ("add_directions", 1, None, added),
+            b.launcher("block_inverse.cl", name, 1, local_size=size, **macros).bind(**given)
+            for name, size, given in (
+                ("apply_block_inverse", (group,), products | added),
+                ("direction_products", (group,), products),
+                ("add_directions", None, added),
             )
         )
         self._change = launcher("inner_products").bind(
@@ -164,7 +164,7 @@ class LbfgsSteps:
                 "roots": self.shelf.values,
                 "more": level > 0,
             }
-            self._levels.append(((self._size[0], len(own)), given))
+            self._levels.append(((self._size[0] * len(own),), given))
 
     def _set_directions(self, directions):
         """Uploads directions (scene, places (k,), values (k,))."""
@@ -192,4 +192,4 @@ class LbfgsSteps:
             of=b.device.put(np.repeat(np.arange(len(scene)), lengths)[order], np.int32),
             values=b.put(values[order]),
         )
-        self._directions = (self._size[0], len(scene)), b.items(len(variables))
+        self._directions = (self._size[0] * len(scene),), b.items(len(variables))
