@@ -95,7 +95,7 @@ def test_psfs_are_of_observations_on_the_frames_pixels(psf, grid, n):
 
 def test_stars_with_psfs_of_their_own_are_left_out():
     psf, place = pixel_psf(), np.array([20.3, 22.4])
-    field = StarPSFs(psf, None, place[None], (psf,), np.zeros((1, 1)))
+    field = StarPSFs(psf, None, place[None], (psf,), np.zeros((1, 1)), np.zeros(1, bool))
     home, one = Frame(GRID, model_psf(0.8)), with_psf_field(observation(), field)
     assert sampled_psfs(home, [one], place) == ()
     assert sampled_psfs(home, [one], place + 5) == (psf,)

@@ -76,7 +76,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
-    n_own = np.zeros((2, len(near)), int)
+    n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
@@ -85,8 +85,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         if bad.any():
             image = image.without(bad)
         there = frame.grid.positions_in(observation.grid, *positions[near].T)
-        image, own = with_star_psfs(image, sources, there, settings.fit_sky)
-        n_own += own, image.inside * len(image.usable)
+        image, wide, own = with_star_psfs(image, sources, there, settings.fit_sky)
+        n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         if own.any():
             levels[-1] = replace(levels[-1], error=np.full_like(levels[-1].error, np.inf))
@@ -103,7 +103,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
-    stars, still = near[n_own[0] > 0], near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
+    n_wide, n_own, n_all = n_channels
+    stars, still = near[n_wide > 0], near[(n_own > 0) & (n_own == n_all)]
     if len(stars):
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:

@@ -110,10 +110,32 @@ def _core(light, usable, masked, psf, band, fwhm):
 
     None if the light beside the group is not that of a star.
     """
+    for guess in _guesses(light, usable, masked):
+        centred = _ring_about(light, usable, masked, guess, fwhm)
+        if centred is not None:
+            place, ring, inner, scatter = centred
+            if scatter > MAX_SCATTER or not _falls_like(light, ring, place, psf, band, fwhm):
+                return None
+            return StarCore(place, inner, float(np.median(light[ring])), masked)
+    return None
+
+
+def _guesses(light, usable, masked):
+    """Two first guesses (2,) [px] of a core's place: by the light beside it, and its deepest pixel.
+
+    Light that falls steeply is that of the side where fewest pixels are masked.
+    """
     edge = usable & binary_dilation(masked, np.ones((3, 3), bool))
     y, x = np.nonzero(edge)
     weight = np.maximum(light[edge], 0) ** 2
-    guess = np.array([weight @ y, weight @ x]) / weight.sum()
+    by_light = np.array([weight @ y, weight @ x]) / weight.sum()
+    depth = distance_transform_edt(masked)
+    deepest = np.argwhere(depth == depth.max())
+    return by_light, deepest[np.hypot(*(deepest - by_light).T).argmin()]
+
+
+def _ring_about(light, usable, masked, guess, fwhm):
+    """The place (2,) [px] of a core, its ring, inner radius and scatter; None without a ring."""
     top = np.array(light.shape) - 1
     for _ in range(2):  # ring and position depend on each other
         at = tuple(np.clip(np.rint(guess).astype(int), 0, top))
@@ -123,9 +145,7 @@ def _core(light, usable, masked, psf, band, fwhm):
         if ring is None:
             return None
         guess, scatter = _centred(light, ring, guess, fwhm)
-    if scatter > MAX_SCATTER or not _falls_like(light, ring, guess, psf, band, fwhm):
-        return None
-    return StarCore(guess, inner, float(np.median(light[ring])), masked)
+    return guess, ring, inner, scatter
 
 
 def _ring(usable, masked, place, fwhm):
@@ -180,7 +200,7 @@ def _falls_like(light, ring, place, psf, band, fwhm):
     outer = away > np.median(away)
     radii = np.array([np.median(away[~outer]), np.median(away[outer])])
     bright = np.array([np.median(light[ring][part]) for part in (~outer, outer)])
-    if not bright[0] > bright[1] > 0:
+    if not (bright > 0).all():
         return False
     # beyond the PSF's image, light is compared with that at the same ratio of radii within it
     inside = radii * min(1.0, inscribed_radius(psf, band) / radii[1])
@@ -189,6 +209,6 @@ def _falls_like(light, ring, place, psf, band, fwhm):
         np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
         for r in inside
     ]
-    if not own[0] > own[1] > 0:
+    if not min(own) > 0:
         return bool(bright[1] < bright[0])
     return bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])

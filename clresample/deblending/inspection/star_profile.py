@@ -9,6 +9,9 @@ import numpy as np
 # [sigma] Smallest light of a ring; smallest number of its pixels; number of rings over which the
 # slope at either end is measured.
 RING_SIGMAS, MIN_RING, END_RINGS = 3.0, 6, 3
+# Powers of the distance among which a halo's is chosen; smallest light of it, in its errors, and
+# its unevenness from ring to ring, which is that of diffraction rings.
+HALO_POWERS, HALO_SIGMAS, HALO_UNEVEN = np.arange(2.0, 8.1, 0.25), 3.0, 0.3
 LOG_STEP = 0.1  # of a radius, over which the slope at the rim is taken
 
 
@@ -59,6 +62,33 @@ class RadialProfile:
     def end(self) -> float:
         """Radius [px] of the outermost ring."""
         return float(np.exp(self.log_radius[-1]))
+
+    @classmethod
+    def measure_halo(cls, data, usable, away, sigma, radius):
+        """Fits a power of the distance to rings of all pixels (My, Mx), that is light at `radius`.
+
+        Diffraction rings average out. None if the halo is below HALO_SIGMAS of its error.
+        """
+        rings, r, light, error = np.rint(away[usable]).astype(int), [], [], []
+        value = data[usable]
+        for k in range(rings.min(initial=0), rings.max(initial=-1) + 1):
+            own = value[rings == k]
+            if own.size >= MIN_RING:
+                r.append(k)
+                light.append(np.median(own))
+                error.append(sigma / np.sqrt(own.size))
+        if not r:
+            return None
+        light, relative = np.array(light), np.array(r) / radius
+        weight = 1 / (np.square(error) + np.square(HALO_UNEVEN * light))
+        shape = relative ** -HALO_POWERS[:, None]
+        power = (weight * shape**2).sum(axis=1)
+        found = (weight * shape * light).sum(axis=1) / power
+        best = int(np.argmax(found * np.abs(found) * power))
+        if found[best] < HALO_SIGMAS / np.sqrt(power[best]):
+            return None
+        ends = np.log([radius, 2 * radius])
+        return cls(ends, np.log(found[best]) - HALO_POWERS[best] * (ends - ends[0]))
 
     def power(self, radius) -> float:
         """Exponent of the power of the distance by which the light falls at a radius [px]."""

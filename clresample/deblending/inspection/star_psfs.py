@@ -57,6 +57,9 @@ MIN_STAR_RADIUS_FWHM = 1.0
 WIDE_GROW_PX = 3
 # [px] Tolerance in the comparison of positions with those of stars, because of rounding.
 SAME_PLACE_PX = 0.5
+# [sigma] Largest light of the last ring of a profile: brighter rings that rise are those of
+# diffraction, which are the PSF's.
+MAX_END_SIGMAS = 30.0
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
 MIN_USABLE_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 
@@ -97,7 +100,9 @@ class StarPSFs(PSFField):
 
 
 def with_star_psfs(image, sources, places, sky):
-    """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
+    """The InspectedImage with own PSFs for masked stars, and two numbers of channels (S,) of each.
+
+    Those in which it has a wide core, and those of them in which it does not keep the PSF's core.
 
     The masked pixels of all cores grow by WIDE_GROW_PX, or `spoilt.GROW_PX` for stars with cores
     below MIN_STAR_RADIUS_FWHM, which keep the PSF passed within its image and do not count; see
@@ -107,9 +112,9 @@ def with_star_psfs(image, sources, places, sky):
     sky: True if a sky level is fitted
     """
     stars = [i for i, source in enumerate(sources) if _may_be_star(source) and image.inside[i]]
-    found, n_own = {}, np.zeros(len(sources), int)
+    found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
     if not stars or image.usable.all():
-        return image, n_own
+        return image, n_wide, n_own
     wide = np.zeros(image.usable.shape, bool)
     for c in range(len(wide)):
         for core in star_cores(image.significance[c], image.usable[c], image.observation.psf, c):
@@ -128,20 +133,21 @@ def with_star_psfs(image, sources, places, sky):
     for i, cores in list(found.items()):
         own = {c: _measure_psf(image, c, i, *core, sky) for c, core in cores.items()}
         own = {c: measured for c, measured in own.items() if measured is not None}
-        n_own[i] = sum(cores[c][1] for c in own)
+        n_wide[i] = sum(cores[c][1] for c in own)
+        n_own[i] = sum(not measured.keeps_core for measured in own.values())
         found[i] = own
     found = {i: own for i, own in found.items() if own}
     if not found:
-        return image, n_own
+        return image, n_wide, n_own
     o, numbers = image.observation, sorted(found)
     psfs = tuple(_combine_psfs(_listed_psf(o, places[i]), found[i]) for i in numbers)
     flux_error = np.zeros((len(numbers), len(wide)))
     for k, i in enumerate(numbers):
-        for c, (_, _, part) in found[i].items():
-            flux_error[k, c] = part
+        for c, measured in found[i].items():
+            flux_error[k, c] = measured.flux_error
     keeps_core = n_own[numbers] == 0
     field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, flux_error, keeps_core)
-    return dataclasses.replace(image, observation=with_psf_field(o, field)), n_own
+    return dataclasses.replace(image, observation=with_psf_field(o, field)), n_wide, n_own
 
 
 def replace_by_stars(sources, numbers, still):
@@ -177,44 +183,64 @@ def _listed_psf(observation, place):
 
 
 def _combine_psfs(given, own):
-    """Replaces bands of a PSF by samples {band: (image, centre, flux error)}."""
-    shape = np.max([given.images.shape[1:], *(image.shape for image, *_ in own.values())], axis=0)
+    """Replaces bands of a PSF by {band: MeasuredPSF}."""
+    shape = np.max([given.images.shape[1:], *(one.image.shape for one in own.values())], axis=0)
     images, centers = np.zeros((given.n_bands, *shape)), given.center.copy()
     for c, image in enumerate(given.images):
         if c in own:
-            image, centers[c], _ = own[c]
+            image, centers[c] = own[c].image, own[c].center
         images[c, : image.shape[0], : image.shape[1]] = image
     return PSF.restore(images, spacing=given.spacing, center=centers)
 
 
-def _measure_psf(image, c, i, core, is_wide, sky):
-    """Measures the own PSF of star i in channel c: samples, their centre, the flux uncertainty.
+@dataclass(frozen=True, eq=False)
+class MeasuredPSF:
+    """A star's own PSF in a channel.
 
-    The centre (2,) is in samples; for the uncertainty see StarPSFs. None if the star's light does
-    not fall from the core outwards, or that of a small core ends within the PSF's image. The
-    samples' sum is 1 less the light left out of a wide core.
+    image (ny, nx): its samples, center (2,) [samples]; flux_error, keeps_core: see StarPSFs
+    """
+
+    image: np.ndarray
+    center: np.ndarray
+    flux_error: float
+    keeps_core: bool
+
+
+def _measure_psf(image, c, i, core, is_wide, sky):
+    """The MeasuredPSF of star i in channel c.
+
+    None if the star's light does not fall from the core outwards, or that of a star which keeps the
+    PSF's core has no halo beyond the PSF's image. The samples' sum is 1 less the light left out of
+    the core.
     i: number of the model's star; core: StarCore; is_wide, sky: see `with_star_psfs`
     """
     o, fwhm, place = image.observation, float(image.observation.psf.fwhm_px[c]), image.places[i]
     psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
-    middle = core.place if is_wide else place
     # the fit has no sky level, or a fitted one
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
-    radius = core.radius + WIDE_GROW_PX if is_wide else inscribed_radius(psf, c)
+    middle, radius = core.place, core.radius + WIDE_GROW_PX
     away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
-    beside = image.usable[c] & (away >= (radius if is_wide else radius - fwhm))
-    profile = RadialProfile.measure(data, beside, away, image.sigma[c])
+    beside = image.usable[c] & (away >= radius)
+    profile = RadialProfile.measure(data, beside, away, image.sigma[c]) if is_wide else None
+    keeps_core = profile is None or profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    if keeps_core:
+        middle, radius = place, inscribed_radius(psf, c)
+        away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
+        beside = image.usable[c] & (away >= radius - fwhm)
+    measured = data, beside, away, image.sigma[c]
+    profile = _measure_profile(*measured, radius, keeps_core)
     if profile is None:
         return None
     others = np.delete(image.places, i, axis=0)[np.delete(image.inside, i)]
     rest = (data - profile.at(away)) / image.sigma[c]
     free = ~_near_sources(rest, image.usable[c], others, middle, fwhm)
-    profile = RadialProfile.measure(data, beside & free, away, image.sigma[c]) or profile
-    if is_wide:
-        scale = _scale(psf, c, profile, radius)
-    else:
+    measured = data, beside & free, away, image.sigma[c]
+    profile = _measure_profile(*measured, radius, keeps_core) or profile
+    if keeps_core:
         scale = _amplitude(psf, c, data, image.usable[c] & free & (away < radius), middle)
-    if not scale or (not is_wide and profile.end < radius):
+    else:
+        scale = _scale(psf, c, profile, radius)
+    if not scale:
         return None
     rest, free = data - profile.at(away), image.usable[c] & free
     rays, known = _rays(rest, free, middle, radius)
@@ -237,11 +263,19 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     if not total > 0:
         return None
     # the model's star lies at `place`, its light about the middle
-    centre = np.array([-y[0], -x[0]]) / step + (place - middle) / step
-    if not is_wide:
-        return whole / total, centre, 0.0
+    center = np.array([-y[0], -x[0]]) / step + (place - middle) / step
+    if keeps_core:
+        return MeasuredPSF(whole / total, center, 0.0, keeps_core)
     own = profile.with_core(away, radius) + more
-    return own / total, centre, abs(profile.power(radius) - 2)
+    return MeasuredPSF(own / total, center, abs(profile.power(radius) - 2), keeps_core)
+
+
+def _measure_profile(data, usable, away, sigma, radius, keeps_core):
+    """RadialProfile of a star, of the halo beyond a radius if it keeps the PSF's core; or None."""
+    profile = RadialProfile.measure(data, usable, away, sigma)
+    if not keeps_core or (profile is not None and profile.end > radius):
+        return profile
+    return RadialProfile.measure_halo(data, usable, away, sigma, radius)
 
 
 def _near_sources(rest, usable, places, star, fwhm):

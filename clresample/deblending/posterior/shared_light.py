@@ -29,9 +29,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.box import intersect_boxes
-from ..profiles import GalaxyProfile, StarProfile
+from ..profiles import GalaxyProfile
 from ..solver.multiscale.prior import without_profile
-from ..start.population import contamination_factors
+from ..start.population import contamination_factors, is_exact
 from .errors import FluxChanges
 from .profile_modes import SCATTER, SHAPE_MODES
 
@@ -120,7 +120,7 @@ def _contamination(posterior):
             shared = block[layout.n_modes[i] + bands, layout.n_modes[j] + bands]
             normal[0, :, i, j] = normal[0, :, j, i] = shared
     spectra = solution.spectra if layout.ties is None else solution.spectra[:, layout.ties.first]
-    stars = np.array([isinstance(shape, StarProfile) for shape in solution.shapes])
+    stars = np.array([is_exact(shape) for shape in solution.shapes])
     source = np.asarray(solution.source)
     return contamination_factors(normal, spectra.T[None], source[None], stars[None])[0]
 

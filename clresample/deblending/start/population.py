@@ -23,9 +23,9 @@ that of all other sources, an error in M changes the light of u by
     E = NEIGHBOUR_MODEL_ERROR max(0, <u, M> - OWN_LIGHT alike <u, u>) / |u|
 
 in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
-Stars' light in M counts by STAR_MODEL_ERROR. Of two galaxies that are alike each has its own light
-in the data, and neither shape is doubted: alike is |u| / |M|, at most 1, in the mean of M's sources
-by their light in u.
+Light of stars in M counts by STAR_MODEL_ERROR, unless pixels alias it. Of two galaxies that are
+alike each has its own light in the data, and neither shape is doubted: alike is |u| / |M|, at most
+1, in the mean of M's sources by their light in u.
 The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
 its neighbours' shapes unchanged. A faint galaxy beside a bright one then has the expected shape;
 the bright one's own data outweigh the prior. Stars have no shape, and their positions are fixed by
@@ -86,7 +86,7 @@ class PopulationPrior:
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text
     own_light (B, 1): OWN_LIGHT in scenes started from large galaxies, 0 in others
-    galaxies, stars (B, n): bool, of which there are galaxies, and stars
+    galaxies, stars (B, n): bool, of which there are galaxies, and stars that are `is_exact`
     """
 
     def __init__(self, shapes, scene, index, n_scenes, n_most, n_parameters):
@@ -98,7 +98,7 @@ class PopulationPrior:
             n = len(shape.mean)
             self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
             self.galaxies[b, i] = isinstance(shape, GalaxyProfile)
-            self.stars[b, i] = isinstance(shape, StarProfile)
+            self.stars[b, i] = is_exact(shape)
             # components of one source differ by more than galaxies
             self._known[b, i] = self.galaxies[b, i] and shape.whole
         self._before = self.mean[..., LEARNED]
@@ -159,11 +159,16 @@ class PopulationPrior:
         self.scatter[at] = scatter[k, i]
 
 
+def is_exact(shape) -> bool:
+    """Returns True for a StarProfile without aliased waves: its error is that of its PSF."""
+    return isinstance(shape, StarProfile) and not shape.sampled
+
+
 def contamination_factors(normal, spectra, source, stars, own_light=OWN_LIGHT):
     """1 + E^2 (k, n) of the components of some scenes; see the module's text.
 
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
-    source (k, n): to which each belongs; stars (k, n): bool, of which there are stars
+    source (k, n): to which each belongs; stars (k, n): bool, those that are `is_exact`
     own_light: OWN_LIGHT, or that of each scene (k, 1)
     """
     light = np.einsum("kci,kcij,kcj->kij", spectra, normal, spectra)
