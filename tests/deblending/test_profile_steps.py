@@ -92,20 +92,26 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
     assert (looking.n_looks - before)[0] < (looking.n_looks - before)[1] <= 6
 
 
-def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch):
-    """In fewer trials, with the doubt of large galaxies from the first on."""
-    fit, looking = valley([1.9, 1.9, 3.4])
-    again: list[int] = []
-    monkeypatch.setattr(fit.expected, "galaxies", np.ones((3, 1), bool))
-    monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: again.extend(scenes))
+@pytest.mark.parametrize(("n_pixels", "again"), [(np.inf, [1, 2, 4]), (10, [1, 2, 4, 5])])
+def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pixels, again):
+    """In fewer trials, with the doubt of large galaxies from the first on.
+
+    Second starts are of scenes whose galaxies grow beyond their earlier and their expected size,
+    and of unexplained ones without an earlier fit.
+    """
+    fit, looking = valley([1.9, 1.9, 3.4, 0.5, 1.9, 0.5])
+    begun: list[int] = []
+    monkeypatch.setattr(looking, "n_pixels", lambda: np.full(6, n_pixels))
+    monkeypatch.setattr(fit.expected, "galaxies", np.ones((6, 1), bool))
+    monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: begun.extend(scenes))
     before = looking.n_looks.copy()
-    profile_fit.start_from(fit, {0: [1.8, 0, 0, 0]})
+    profile_fit.start_from(fit, {0: [1.8, 0, 0, 0], 2: [1.8, 0, 0, 0], 3: [-1.5, 0, 0, 0]})
     fit.run()
     np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
     n_trials = looking.n_looks - before
-    assert n_trials[0] < n_trials[1] and again == [0, 1, 2]
-    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, 0]
-    assert fit.is_known.tolist() == [True, False, False]
+    assert n_trials[0] < n_trials[1] and begun == again
+    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, OWN_LIGHT, 0, 0, 0]
+    assert fit.is_known.tolist() == [True, False, True, True, False, False]
 
 
 def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):

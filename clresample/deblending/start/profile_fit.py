@@ -40,6 +40,7 @@ class ProfileFit:
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
+    begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
@@ -57,7 +58,7 @@ class ProfileFit:
         self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
-        self.is_known = np.zeros(size[0], bool)
+        self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -260,20 +261,25 @@ def start_from(fit, known):
         fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
     scenes = np.unique(fit.looking.scene[galaxies])
     grown = _growth(fit)[scenes].max(axis=1) > MAX_GROWTH
-    fit.is_known[scenes] = True
+    fit.is_known[scenes], fit.begun = True, np.maximum(fit.theta, fit.begun)
     fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
 
 
-def _growth(fit):
-    """ln sigma (B, n) of galaxies beyond the expected one, 0 of others."""
-    return (fit.theta - fit.expected.mean)[..., 0] * fit.expected.galaxies
+def _growth(fit, begun=None):
+    """ln sigma (B, n) of galaxies beyond the expected one, or that of `begun`; 0 of others."""
+    begun = fit.expected.mean if begun is None else begun
+    return (fit.theta - begun)[..., 0] * fit.expected.galaxies
 
 
 def _may_hold_large_galaxies(fit):
-    """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained."""
-    unexplained = fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()
-    return (_growth(fit).max(axis=1) > MAX_GROWTH) | unexplained
+    """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained.
+
+    Galaxies of an earlier fit, which has looked for larger ones, count if they have grown since. It
+    leaves structure to be fitted, so that its smooth profiles never explain all of the data.
+    """
+    unexplained = (fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()) & ~fit.is_known
+    return (_growth(fit, fit.begun).max(axis=1) > MAX_GROWTH) | unexplained
 
 
 def _chi2_as_expected(fit, scenes):
