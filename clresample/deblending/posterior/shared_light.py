@@ -142,10 +142,12 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
         if i in shapes:
             p = _larger_profile(solution, i, shapes[i].size_scatter)
         meet = ((low < high[i]) & (high > low[i])).all(axis=1) & (source != source[i])
-        share = p.sum() / max(np.square(p).sum(), 1e-30)
+        power = np.square(p).sum()
         for j in np.flatnonzero(meet & ~scene.fixed):
             here, there = intersect_boxes(low[i], p.shape, low[j], structure[j].shape)
-            part = share * (p[here] * structure[j][there]).sum()
+            other = scene.profile[j]
+            alike = (p[here] * other[there]).sum() ** 2 / max(np.square(other).sum(), 1e-30)
+            part = p.sum() * (p[here] * structure[j][there]).sum() / max(power - alike, 1e-30)
             out[components[i].source, components[j].source] += part * components[j].spectrum
     return out
 

@@ -108,6 +108,7 @@ class ProfileFit:
         self._restore(before, worse)
         self.population.own_light[worse] = OWN_LIGHT
         self._take(worse)
+        self._step(worse, learn=True)
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
