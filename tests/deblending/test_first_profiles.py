@@ -8,6 +8,7 @@ from clresample import Settings
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.start import first_profiles as first_profiles_module, profile_fit
 from clresample.deblending.start.first_profiles import GROWTH, first_profiles
+from clresample.deblending.start.step_control import StepControl
 
 GIANT = ((48.2, 47.6), (3e5, 2e5, 2.5e5), 14.0)
 SMALL = [
@@ -126,6 +127,20 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
     ((kept, again),) = measured
     assert len(kept)
     np.testing.assert_allclose(kept, again, rtol=1e-5)
+
+
+def test_a_first_start_that_wins_goes_on_with_less_doubt(sized, monkeypatch):
+    """To where no step gains anything: its doubt had held both galaxies of a pair too small."""
+    further = []
+
+    def noted(fit, scenes):
+        given = *fit._equations(scenes), fit.population.galaxies[scenes]
+        further.extend(StepControl(len(fit.theta)).next(scenes, *given)[1])
+
+    monkeypatch.setattr(profile_fit, "fit_faint_shapes", noted)
+    light = np.array([1e4, 9e3, 7e3])
+    sized([((48.2, 47.6), light, 4.0), ((48.2, 53.6), light, 5.6)], spoilt)
+    assert len(further) == 1 and further[0] < profile_fit.CHI2_TOL
 
 
 def test_profiles_do_not_depend_on_the_other_scenes(device, monkeypatch):

@@ -161,6 +161,14 @@ def test_a_scene_ends_when_a_step_gains_chi2_of_one(valley):
     assert (looking.n_looks - before).tolist() == [0, 1]
 
 
+def test_a_step_far_too_long_that_gains_little_is_not_the_end(valley):
+    """It leads from one side of the bottom to the other one: 0.4 of a promised 218."""
+    fit, looking = valley([0.1], promise=2.1978)
+    before = looking.n_looks.copy()
+    fit.run()
+    assert fit.chi2[0] == pytest.approx(100, abs=1) and (looking.n_looks - before)[0] > 1
+
+
 def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):
     """Its parameters stay; a scene takes forty steps at most, one without parameters none."""
     fit, looking = valley([10.0], promise=-1.0)

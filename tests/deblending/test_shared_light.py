@@ -59,6 +59,22 @@ def test_structure_at_another_place_is_counted_there():
     assert not exchanged(np.zeros(2, int)).any()
 
 
+def test_structure_holds_what_a_profile_has_off_its_own():
+    """A galaxy that has a close neighbour's light: all of it, at most all that the galaxy has."""
+    near, own = (gaussian((31, 31), at, 9 * np.eye(2)) for at in ((15, 16), (15, 15)))
+    near, own = near / near.max(), own / own.max()
+    off = near - own * (near * own).sum() / np.square(own).sum()
+    spectra, origin = np.array([[2.0], [50.0]]), np.zeros((2, 2), int)
+    for part in (0.1, 5.0):
+        morphs = near, own + part * off
+        components = tuple(Component(i, (0, 0), m, spectra[i]) for i, m in enumerate(morphs))
+        result = SimpleNamespace(components=components, sources=(0, 1), channels="g")
+        scene = SimpleNamespace(profile=[near, own], origin=origin, fixed=np.zeros(2, bool))
+        found = exchanged_light(result, SimpleNamespace(scene=scene, source=np.arange(2)), {})
+        wanted = min(part * near.sum(), morphs[1].sum()) * spectra[1]
+        np.testing.assert_allclose(found[0, 1], wanted, rtol=1e-6)
+
+
 def test_a_doubted_profile_is_compared_with_the_ring_around_it():
     """A galaxy fitted too small has its core, and structure of its neighbour holds the rest."""
     frame = SimpleNamespace(

@@ -32,6 +32,17 @@ def test_long_steps_are_cut_and_promise_less():
     assert taken == pytest.approx(2 * 3 - 1)
 
 
+def test_long_steps_of_coupled_parameters_keep_their_direction():
+    """Clipped one by one they would gain less than nothing, (1, -1) here."""
+    normal = np.eye(4)
+    normal[0, 1] = normal[1, 0] = 0.999
+    right = normal @ [8.0, -4.0, 0, 0]
+    trial, whole, taken = first_step(right, normal=normal)
+    np.testing.assert_allclose(trial[:2], [MAX_STEP, -MAX_STEP / 2])
+    assert 0 < taken < whole
+    assert taken == pytest.approx(2 * trial[:2] @ right[:2] - trial[:2] @ normal[:2, :2] @ trial[:2])
+
+
 def test_held_components_do_not_move():
     trial, whole, _ = first_step([0.5, 0.5, 0, 0.5], free=np.array([[False]]))
     np.testing.assert_allclose(trial, [0, 0, 0, 1.5], rtol=1e-12)

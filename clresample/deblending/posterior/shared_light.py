@@ -13,13 +13,17 @@ C: posterior covariance of its shape parameters theta, whose prior covariance is
 Structure of a source where another one has its light may be that one's. It is decided by how either
 profile fits, and is as uncertain as it is large: of component t at the place of profile p,
 
-    e = A_t <p, S_t - a p_t> / <p, p> sum p,    a = <S_t, p_t> / <p_t, p_t>
+    e = A_t <p, S_t - a p_t> sum p / (<p, p> - <p, p_t>^2 / <p_t, p_t>),
+    a = <S_t, p_t> / <p_t, p_t>
 
-moves from one source to the other. If the shape of p is doubted, p is drawn larger by one scatter
+moves from one source to the other, all light of t at most: structure has no part of p_t, so that
+only what p has off p_t can be in it. If the shape of p is doubted, p is drawn larger by one scatter
 of its ln sigma under C': a profile that is too small fits its source's core, and structure of the
 neighbour holds the ring around it. Without these two parts 2 in 100 satellites of giant galaxies
 were over 5 % and 5 sigma off with no flag, and none of 32 with them; with p as it was fitted one of
-96 has half of its flux and no flag (bench.ladder, seed 9191).
+96 has half of its flux and no flag (bench.ladder, seed 9191). With <p, p> alone as the divisor most
+fluxes of galaxies 0.4 to 0.8 r_e apart at signal to noise 3000 are over 3 errors off, up to 9, and
+none with it (seed 1 of cli/device_tools/workload.py, 20 blends; XXX).
 """
 
 from __future__ import annotations
@@ -142,12 +146,12 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
         if i in shapes:
             p = _larger_profile(solution, i, shapes[i].size_scatter)
         meet = ((low < high[i]) & (high > low[i])).all(axis=1) & (source != source[i])
-        power = np.square(p).sum()
         for j in np.flatnonzero(meet & ~scene.fixed):
             here, there = intersect_boxes(low[i], p.shape, low[j], structure[j].shape)
-            other = scene.profile[j]
+            other, most = scene.profile[j], components[j].morphology.sum()
             alike = (p[here] * other[there]).sum() ** 2 / max(np.square(other).sum(), 1e-30)
-            part = p.sum() * (p[here] * structure[j][there]).sum() / max(power - alike, 1e-30)
+            off = max(np.square(p).sum() - alike, 1e-30)
+            part = np.clip(p.sum() * (p[here] * structure[j][there]).sum() / off, -most, most)
             out[components[i].source, components[j].source] += part * components[j].spectrum
     return out
 
