@@ -56,7 +56,7 @@ class RenderedModel:
 
     spectra: np.ndarray
     sky: np.ndarray
-    covariance: np.ndarray
+    covariance: np.ndarray | None
     observed: tuple[ComponentImages, ...]
     unfiltered_views: tuple
     power: np.ndarray | None = None
@@ -98,11 +98,13 @@ class _ImageProfile(ComponentProfile):
         return out
 
 
-def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[RenderedModel]:
+def render_models(
+    models: list[MorphologyModel], *, fit_sky=False, errors=True
+) -> list[RenderedModel]:
     """Renders the morphologies of all models, and solves for their spectra, side by side.
 
     models: of equal numbers of observations, these of equal shapes, as of one batch
-    fit_sky: also solve for a level per channel
+    fit_sky: also solve for a level per channel; errors: also compute the covariance and products
     """
     components = []
     for b, model in enumerate(models):
@@ -127,31 +129,21 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     found = []
     for b in range(len(models)):
         at = looking.scene == b
-        found.append(
-            RenderedModel(
-                looking.spectra[at],
-                looking.sky[b],
-                looking.covariance(b),
-                tuple(observed[b]),
-                tuple(bare[b]),
-                *_products(looking, b, models[b]),
-            )
-        )
+        covariance = looking.covariance(b) if errors else None
+        products = _products(looking, b, models[b]) if errors else ()
+        images = tuple(observed[b]), tuple(bare[b])
+        solved = looking.spectra[at], looking.sky[b], covariance
+        found.append(RenderedModel(*solved, *images, *products))
     return found
 
 
 def model_of(fit, which=()):
-    """All morphologies of a fit, and after them the cores of the components `which` (k,), if any.
-
-    Only with cores the model has the fit's spectra, about which products are asked for.
-    """
+    """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
     scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
     cores = [morphs[i] * scene.profile[i] for i in which]
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
-    spectra = None
-    if len(which):
-        spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
+    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
     given = source, origin, morphs + cores, spectra, fit.state.sky
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 

@@ -50,7 +50,8 @@ def best_starts(starts, fit_sky):
     All scenes have equally many starts, compared with their best spectra and sky.
     """
     fits = [fit for of_scene in starts for fit in of_scene]
-    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    models, chi2 = [model_of(fit) for fit in fits], []
+    images = render_models(models, fit_sky=fit_sky, errors=False)
     for fit, seen in zip(fits, images, strict=True):
         residuals = seen.residuals(fit.scene.channels(), fit.views)
         pairs = zip(fit.views, residuals, strict=True)
