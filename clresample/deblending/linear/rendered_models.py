@@ -56,7 +56,7 @@ class RenderedModel:
 
     spectra: np.ndarray
     sky: np.ndarray
-    covariance: np.ndarray | None
+    covariance: np.ndarray
     observed: tuple[ComponentImages, ...]
     unfiltered_views: tuple
     power: np.ndarray | None = None
@@ -98,43 +98,46 @@ class _ImageProfile(ComponentProfile):
         return out
 
 
-def render_models(
-    models: list[MorphologyModel], *, fit_sky=False, errors=True
-) -> list[RenderedModel]:
+def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[RenderedModel]:
     """Renders the morphologies of all models, and solves for their spectra, side by side.
 
     models: of equal numbers of observations, these of equal shapes, as of one batch
-    fit_sky: also solve for a level per channel; errors: also compute the covariance and products
+    fit_sky: also solve for a level per channel
     """
-    components = []
-    for b, model in enumerate(models):
-        rows = zip(model.source, model.origin, model.morphs, strict=True)
-        for i, (source, origin, morph) in enumerate(rows):
-            shape = _ImageProfile(morph, origin, model.frame)
-            place = np.asarray(origin, float)
-            components.append(StartComponent(b, i, int(source), shape, place, model.frame))
-    looking = _looking([m.views for m in models], components, fit_sky)
-    scenes, thetas = np.arange(len(models)), [np.zeros(0)] * len(components)
-    brightness = np.zeros(len(components))
-    looking.render(scenes, thetas, brightness, slopes=False, whiten=False)
+    looking = _rendered(models, [m.views for m in models], fit_sky)
     observed = _taken(looking)
     looking.whiten()
     looking.solve(0.0)
     bare = [[None] * len(m.views) for m in models]
     others = [[b or v for b, v in zip(m.unfiltered_views, m.views, strict=True)] for m in models]
     if any(b is not None for m in models for b in m.unfiltered_views):
-        again = _looking(others, components, False)
-        again.render(scenes, thetas, brightness, slopes=False, whiten=False)
-        bare = _taken(again)
+        bare = _taken(_rendered(models, others, False))
     found = []
     for b in range(len(models)):
         at = looking.scene == b
-        covariance = looking.covariance(b) if errors else None
-        products = _products(looking, b, models[b]) if errors else ()
-        images = tuple(observed[b]), tuple(bare[b])
-        solved = looking.spectra[at], looking.sky[b], covariance
-        found.append(RenderedModel(*solved, *images, *products))
+        found.append(
+            RenderedModel(
+                looking.spectra[at],
+                looking.sky[b],
+                looking.covariance(b),
+                tuple(observed[b]),
+                tuple(bare[b]),
+                *_products(looking, b, models[b]),
+            )
+        )
     return found
+
+
+def solve_models(models: list[MorphologyModel], *, fit_sky=False):
+    """Spectra (n, C) and sky (C,) of least squares of each model, and chi2 with the sky's prior.
+
+    For its arguments see `render_models`.
+    """
+    looking = _rendered(models, [m.views for m in models], fit_sky)
+    looking.whiten()
+    looking.solve(0.0)
+    spectra = [looking.spectra[looking.scene == b] for b in range(len(models))]
+    return list(zip(spectra, looking.sky, looking.compute_residuals(0.0), strict=True))
 
 
 def model_of(fit, which=()):
@@ -148,9 +151,20 @@ def model_of(fit, which=()):
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 
 
-def _looking(views, components, fit_sky):
-    precision = Precision.of(views[0][0].op.dtype)
-    return linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+def _rendered(models, views, fit_sky):
+    """The LinearisedScenes of MorphologyModels in views of each, rendered but not whitened."""
+    components = []
+    for b, model in enumerate(models):
+        rows = zip(model.source, model.origin, model.morphs, strict=True)
+        for i, (source, origin, morph) in enumerate(rows):
+            shape = _ImageProfile(morph, origin, model.frame)
+            place = np.asarray(origin, float)
+            components.append(StartComponent(b, i, int(source), shape, place, model.frame))
+    precision, n = Precision.of(views[0][0].op.dtype), len(components)
+    looking = linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+    given = np.arange(len(models)), [np.zeros(0)] * n, np.zeros(n)
+    looking.render(*given, slopes=False, whiten=False)
+    return looking
 
 
 def _products(looking, b, model):
