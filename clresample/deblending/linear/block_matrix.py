@@ -70,7 +70,7 @@ class BlockCholesky:
                 near[j].add(i)
         self.order, self._later = _eliminated(near, self.sizes)
         ridge, (least, most) = RIDGE, GROWING_RIDGE
-        while not self._factorises(matrix, ridge):
+        while not self._factorise(matrix, ridge):
             if ridge >= most:
                 raise np.linalg.LinAlgError("not positive definite by more than rounding")
             ridge = min(max(least, 4 * ridge), most)
@@ -101,14 +101,8 @@ class BlockCholesky:
             if self._later[v]:
                 yield self._below[v]
 
-    def _factorises(self, matrix, ridge):
-        try:
-            self._factorise(matrix, ridge)
-        except np.linalg.LinAlgError:
-            return False
-        return True
-
     def _factorise(self, matrix, ridge):
+        """Factorises the matrix with a ridge; returns False if it is not positive definite."""
         place = {node: at for at, node in enumerate(self.order)}
         rest = {}
         for (i, j), block in matrix.items():
@@ -119,8 +113,12 @@ class BlockCholesky:
             rest[(i, j) if late_first else (j, i)] = scaled if late_first else scaled.T
         self._lower: dict[int, np.ndarray] = {}
         self._below: dict[int, np.ndarray] = {}
-        for v in self.order:
-            self._eliminate(v, rest)
+        try:
+            for v in self.order:
+                self._eliminate(v, rest)
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def _eliminate(self, v, rest):
         """Factorises node v's columns and subtracts their products from the rest."""

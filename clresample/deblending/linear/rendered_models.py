@@ -104,26 +104,14 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     models: of equal numbers of observations, these of equal shapes, as of one batch
     fit_sky: also solve for a level per channel
     """
-    components = []
-    for b, model in enumerate(models):
-        rows = zip(model.source, model.origin, model.morphs, strict=True)
-        for i, (source, origin, morph) in enumerate(rows):
-            shape = _ImageProfile(morph, origin, model.frame)
-            place = np.asarray(origin, float)
-            components.append(StartComponent(b, i, int(source), shape, place, model.frame))
-    looking = _looking([m.views for m in models], components, fit_sky)
-    scenes, thetas = np.arange(len(models)), [np.zeros(0)] * len(components)
-    brightness = np.zeros(len(components))
-    looking.render(scenes, thetas, brightness, slopes=False, whiten=False)
+    looking = _rendered(models, [m.views for m in models], fit_sky)
     observed = _taken(looking)
     looking.whiten()
     looking.solve(0.0)
     bare = [[None] * len(m.views) for m in models]
     others = [[b or v for b, v in zip(m.unfiltered_views, m.views, strict=True)] for m in models]
     if any(b is not None for m in models for b in m.unfiltered_views):
-        again = _looking(others, components, False)
-        again.render(scenes, thetas, brightness, slopes=False, whiten=False)
-        bare = _taken(again)
+        bare = _taken(_rendered(models, others, False))
     found = []
     for b in range(len(models)):
         at = looking.scene == b
@@ -140,25 +128,43 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     return found
 
 
-def model_of(fit, which=()):
-    """All morphologies of a fit, and after them the cores of the components `which` (k,), if any.
+def solve_models(models: list[MorphologyModel], *, fit_sky=False):
+    """Spectra (n, C) and sky (C,) of least squares of each model, and chi2 with the sky's prior.
 
-    Only with cores the model has the fit's spectra, about which products are asked for.
+    For its arguments see `render_models`.
     """
+    looking = _rendered(models, [m.views for m in models], fit_sky)
+    looking.whiten()
+    looking.solve(0.0)
+    spectra = [looking.spectra[looking.scene == b] for b in range(len(models))]
+    return list(zip(spectra, looking.sky, looking.compute_residuals(0.0), strict=True))
+
+
+def model_of(fit, which=()):
+    """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
     scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
     cores = [morphs[i] * scene.profile[i] for i in which]
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
-    spectra = None
-    if len(which):
-        spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
+    spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
     given = source, origin, morphs + cores, spectra, fit.state.sky
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 
 
-def _looking(views, components, fit_sky):
-    precision = Precision.of(views[0][0].op.dtype)
-    return linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+def _rendered(models, views, fit_sky):
+    """The LinearisedScenes of MorphologyModels in views of each, rendered but not whitened."""
+    components = []
+    for b, model in enumerate(models):
+        rows = zip(model.source, model.origin, model.morphs, strict=True)
+        for i, (source, origin, morph) in enumerate(rows):
+            shape = _ImageProfile(morph, origin, model.frame)
+            place = np.asarray(origin, float)
+            components.append(StartComponent(b, i, int(source), shape, place, model.frame))
+    precision, n = Precision.of(views[0][0].op.dtype), len(components)
+    looking = linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+    given = np.arange(len(models)), [np.zeros(0)] * n, np.zeros(n)
+    looking.render(*given, slopes=False, whiten=False)
+    return looking
 
 
 def _products(looking, b, model):

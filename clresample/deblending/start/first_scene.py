@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...sky.sources import PointSource
-from ..linear.rendered_models import model_of, render_models
+from ..linear.rendered_models import model_of, solve_models
 from ..solver.scene import Scene, State
 from .boxes import component_box
 
@@ -50,11 +50,9 @@ def best_starts(starts, fit_sky):
     All scenes have equally many starts, compared with their best spectra and sky.
     """
     fits = [fit for of_scene in starts for fit in of_scene]
-    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
-    for fit, seen in zip(fits, images, strict=True):
-        residuals = seen.residuals(fit.scene.channels(), fit.views)
-        pairs = zip(fit.views, residuals, strict=True)
-        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
-        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
+    solved, chi2 = solve_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    for fit, (spectra, sky, own) in zip(fits, solved, strict=True):
+        chi2.append(own)
+        fit.state = replace(fit.state, spectra=spectra, sky=sky)
     best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
     return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]

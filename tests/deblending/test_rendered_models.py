@@ -8,7 +8,11 @@ from helpers.scenes import BRIGHT, SHAPE, frame, observe
 from helpers.start import least_squares, rendered, view, views
 
 from clresample.deblending.linear import rendered_models as room
-from clresample.deblending.linear.rendered_models import MorphologyModel, render_models
+from clresample.deblending.linear.rendered_models import (
+    MorphologyModel,
+    render_models,
+    solve_models,
+)
 from clresample.deblending.linear.slot_observation import SlotObservation
 from clresample.deblending.profiles import StarProfile
 from clresample.deblending.start.star_weights import MIN_PSF_ERROR_SIGMA, allow_for_psf_error
@@ -91,6 +95,16 @@ def test_models_are_seen_side_by_side_each_with_its_own_spectra(
     assert all(
         seen.unfiltered_views == (None, None) for seen in render_models(models, fit_sky=fit_sky)
     )
+    solved = solve_models(models, fit_sky=fit_sky)
+    for model, seen, (spectra, level, chi2) in zip(models, found, solved, strict=True):
+        np.testing.assert_array_equal(spectra, seen.spectra)
+        np.testing.assert_array_equal(level, seen.sky)
+        pairs = zip(seen.residuals((slice(0, 1), slice(1, 3)), model.views), model.views)
+        wanted = sum((np.square(left) * v.weights).sum() for left, v in pairs)
+        if fit_sky:
+            known = np.concatenate([v.sky_precision for v in model.views])
+            wanted += known @ np.square(level)
+        assert chi2 == pytest.approx(wanted, rel=close)
 
 
 def star(flux):
