@@ -60,13 +60,25 @@ SOURCES = [
     for path in sorted((ROOT / folder).rglob("*"))
     if path.suffix in (".py", ".cl", ".h")
 ]
-parsed = functools.cache(ast.parse)
+KEPT = ast.Import, ast.ImportFrom, ast.ClassDef, ast.FunctionDef
+
+
+@functools.cache
+def parsed(source):
+    """Imports, classes and functions of a Python source, inside others too; no expressions."""
+    found, left = [], [ast.parse(source)]
+    while left:
+        node = left.pop()
+        found += [node] if isinstance(node, KEPT) else []
+        inner = ast.iter_child_nodes(node)
+        left += (n for n in inner if isinstance(n, (ast.stmt, ast.excepthandler, ast.match_case)))
+    return found
 
 
 def imported(name, source, is_package=False):
     """Every module that module `name` imports, at the top or inside functions, in full."""
     home = name.split(".") if is_package else name.split(".")[:-1]
-    for node in ast.walk(parsed(source)):
+    for node in parsed(source):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -133,8 +145,8 @@ def find_circle(imports):
 
 def too_long(source, max_class=MAX_CLASS, max_function=MAX_FUNCTION):
     """Classes and functions of a Python source that are over the limits, with their lengths."""
-    for node in ast.walk(parsed(source)):
-        n_lines = getattr(node, "end_lineno", 0) - getattr(node, "lineno", 0) + 1
+    for node in parsed(source):
+        n_lines = node.end_lineno - node.lineno + 1
         if isinstance(node, ast.ClassDef) and n_lines > max_class:
             yield f"class {node.name}: {n_lines} lines"
         if isinstance(node, ast.FunctionDef) and n_lines > max_function:

@@ -317,7 +317,7 @@ def disturbed(sky, out, whole, took_s, what, rng):
 
 
 def soak(times, seed, faults):
-    """Rows of so many runs that are killed, whole runs and single workers by turns; then faults."""
+    """Rows of so many runs that are killed, single workers and whole runs by turns; then faults."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         sky, whole = folder / "sky", folder / "whole"
@@ -328,7 +328,7 @@ def soak(times, seed, faults):
             raise RuntimeError("the undisturbed run failed")
         took_s = time.monotonic() - began
         for i in range(times):
-            what, rng = ("run", "worker")[i % 2], random.Random(f"{seed} {i}")
+            what, rng = ("worker", "run")[i % 2], random.Random(f"{seed} {i}")
             yield disturbed(sky, folder / f"out{i}", whole, took_s, what, rng)
         for what in faults:
             yield {"what": what} | FAULTS[what](sky, folder / what, whole, took_s)

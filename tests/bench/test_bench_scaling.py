@@ -71,13 +71,13 @@ def test_the_page_holds_what_follows_from_its_figures():
     assert "| Rubin patch, 10' x 10' | 3,600 | 1 | 3,600 |" in other
 
 
-def test_a_small_field_by_workers(tmp_path, monkeypatch):
+def test_a_small_field_by_a_worker(tmp_path, monkeypatch):
     pytest.importorskip("galsim")
     pytest.importorskip("sep")
-    given = ["--quick", "--sizes", "160", "--density", "90", "--seed", "3"]
+    given = ["--quick", "--sizes", "160", "--density", "90", "--seed", "3", "--workers", "1"]
     for name in ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"):  # set for the workers
         monkeypatch.setenv(name, "1")
-    one, two = bench_json(tmp_path, "scaling", *given)["rows"]
-    assert one.keys() == two.keys() >= {name for name, *_ in scaling.COLUMNS}
-    assert one["n_sources"] == two["n_sources"] == two["measured"] > 3
-    assert one["speed_up"] == 1 and 0 < two["own_cost"] < 1 and two["peak_gb"] > 0.1
+    (row,) = bench_json(tmp_path, "scaling", *given)["rows"]
+    assert row.keys() >= {name for name, *_ in scaling.COLUMNS}
+    assert row["n_sources"] == row["measured"] > 3
+    assert row["speed_up"] == 1 and 0 < row["own_cost"] < 1 and row["peak_gb"] > 0.1

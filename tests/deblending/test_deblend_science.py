@@ -39,23 +39,23 @@ def test_flux_errors_of_blended_stars_are_honest():
         "fine": (Grid.flat((40, 40), 0.1), (1.6,), ("v",)),
         "coarse": (Grid.flat((20, 21), 0.2, angle_deg=30), (1.6, 1.4), ("g", "r")),
     }
-    images, channels = {}, []
+    images, psfs, channels = {}, {}, []
     for name, (grid, sigmas, bands) in instruments.items():
         images[name] = np.array([[star(grid, s, p) for p in positions] for s in sigmas])
+        psfs[name] = PSF.gaussian(np.array(sigmas), n_pixels=31)
         channels += bands
     truth = rng.uniform(50, 150, (len(positions), len(channels)))  # [counts], noise 1
     blends, sources = [], tuple(PointSource(sky_deg=p) for p in positions)
     for _ in range(N_NOISE):
         observations, first = [], 0
-        for name, (grid, sigmas, bands) in instruments.items():
+        for name, (grid, _, bands) in instruments.items():
             spectra = truth[:, first : first + len(bands)]
             first += len(bands)
             clean = np.einsum("sc,csyx->cyx", spectra, images[name])
             observations.append(
                 Observation(
-                    clean + rng.standard_normal(clean.shape),
-                    PSF.gaussian(np.array(sigmas), n_pixels=31),
-                    grid, weights=1.0, channels=bands, name=name,
+                    clean + rng.standard_normal(clean.shape), psfs[name], grid,
+                    weights=1.0, channels=bands, name=name,
                 )
             )  # fmt: skip
         frame = blends[0].frame if blends else model_frame(observations)

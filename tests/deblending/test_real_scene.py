@@ -96,8 +96,7 @@ def test_it_writes_the_figure(fitted):
     assert (folder / "deblended.png").stat().st_size < 400_000
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, seed):
+def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data):
     """The brightest ones are spirals that need two components.
 
     Where smooth profiles of these are all that the second fit begins with, it ends at 1.29 in g,
@@ -106,7 +105,7 @@ def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, see
     if any(word in get_device().name.lower() for word in SIMULATED):
         pytest.skip(f"{get_device().name} takes minutes")
     observation, sources = hsc_blend(data)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     places = [np.array(s.position_px) + rng.normal(0, PLACE_PX, 2) for s in sources]
     result = deblend([observation], [ExtendedSource(position_px=tuple(p)) for p in places])
     assert result.status == "converged"

@@ -1,6 +1,7 @@
 """The HATS layout: partitions, index, metadata; LSDB opens it where it is installed."""
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -110,10 +111,10 @@ def test_a_flat_field_is_refused_before_it_runs(monkeypatch):
 
 
 def test_a_field_leaves_it_on_request(sky, done, tmp_path):
-    one = mosaics_of(sky)[:1]
-    run_field(one, tmp_path, options=FieldOptions(hats=True, passes=1))
-    catalogue = QTable.read(tmp_path / "catalogue.fits")
-    (path,) = tmp_path.rglob("Npix=*.parquet")
+    folder = shutil.copytree(done[0], tmp_path / "again")
+    run_field(mosaics_of(sky), folder, options=FieldOptions(hats=True), resume=True)
+    catalogue = QTable.read(folder / "catalogue.fits")
+    (path,) = folder.rglob("Npix=*.parquet")
     there = parquet.ParquetFile(path).read()
     assert sorted(there["id"].to_pylist()) == catalogue["id"].tolist()
 

@@ -14,11 +14,11 @@ def test_disturbed_runs_end_with_the_same_catalogue(monkeypatch):
     pytest.importorskip("sep")
     from bench.kills import fields
 
-    monkeypatch.setattr(fields, "WRITES", 2)
+    monkeypatch.setattr(fields, "WRITES", 1)
     monkeypatch.setattr(fields, "WORKERS", 1)  # a process that begins takes a core-second
     monkeypatch.setattr(fields, "SIZE", 128)  # [px]
     monkeypatch.setattr(fields, "TALL", 320)  # [px]
-    rows = list(fields.soak(2, 3, ("disk", "tile", "write")))
-    assert [row["what"] for row in rows] == ["run", "worker", "disk", "tile", "write"]
-    assert sum(row["kills"] for row in rows[:2]) >= 1  # a moment may come after the end
+    rows = list(fields.soak(1, 3, ("disk", "tile", "write")))
+    assert [row["what"] for row in rows] == ["worker", "disk", "tile", "write"]
+    assert all(row["kills"] for row in rows)
     assert all(row["good"] for row in rows), rows

@@ -166,7 +166,8 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     assert main(["simulate", "field", "-o", str(sky), *size]) == 0
     assert main(["simulate", "field", "-o", str(sky)]) == 2  # kept
     command = ["field", str(sky / "field.toml"), "-o", str(out), "--quiet"]
-    assert main([*command, "--workers", "2"]) == 0
+    assert main([*command, "--device", "no such device"]) == 2
+    assert main([*command, "--workers", "2"]) == 0  # of the mistake nothing is left in the way
     printed = capsys.readouterr().out
     assert "converged" in printed and str(out / "catalogue.fits") in printed
     before = (out / "catalogue.fits").read_bytes()
@@ -174,9 +175,6 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     capsys.readouterr()
     assert main([*command[:3], str(tmp_path / "other"), "--worker-memory", "100M"]) == 2
     assert "--worker-memory is 100M, must be 1G or more" in capsys.readouterr().err
-    mistaken = ["field", str(sky / "field.toml"), "-o", str(tmp_path / "other"), "--quiet"]
-    assert main([*mistaken, "--device", "no such device"]) == 2
-    assert main([*mistaken, "--workers", "0"]) == 0  # of the mistake nothing is left in the way
     assert main([*command, "--resume", "--workers", "0"]) == 0
     assert (out / "catalogue.fits").read_bytes() == before
     assert main([*command, "--overwrite", "--workers", "0"]) == 0

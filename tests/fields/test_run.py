@@ -163,14 +163,13 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
 
 
-@pytest.mark.parametrize(("tile_px", "n_tiles"), [(96, 4), (56, 9)])
-def test_tiles_leave_no_seams(done, sky, tmp_path, tile_px, n_tiles):
+def test_tiles_leave_no_seams(done, sky, tmp_path):
     """Sources and their fits are in one order, however the field was searched: fits side by side
     round alike."""
     folder, _ = done
-    options = FieldOptions(tile_px=tile_px, overlap_px=60)
+    options = FieldOptions(tile_px=56, overlap_px=60)
     run_field(mosaics_of(sky), tmp_path, options=options)
-    assert len(list((tmp_path / "work").glob("tile-*.npz"))) == n_tiles
+    assert len(list((tmp_path / "work").glob("tile-*.npz"))) == 9
     differences, n_others = compared(folder, tmp_path)
     assert n_others == 0
     assert np.abs(differences).max() == 0
