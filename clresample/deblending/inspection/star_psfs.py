@@ -242,10 +242,9 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         scale = _scale(psf, c, profile, radius)
     if not scale:
         return None
-    rest, free = data - profile.at(away), image.usable[c] & free
-    rays, known = _rays(rest, free, middle, radius)
+    rays, seen, free = _rays(data - profile.at(away), image.usable[c], free, middle, radius)
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
-    lasting = _lasting(rays, known, light, int(np.ceil(radius)), fwhm)
+    lasting = _lasting(rays, seen & free, seen & ~free, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image
     step, low = psf.spacing, -middle
     high = np.array([n_y - 1, n_x - 1]) - middle
@@ -302,10 +301,10 @@ def _near_sources(rest, usable, places, star, fwhm):
     return found
 
 
-def _rays(data, usable, place, radius):
-    """Samples an image (My, Mx) along rays from a place: (radii, angles), and their validity.
+def _rays(data, usable, free, place, radius):
+    """Samples an image (My, Mx) along rays from a place: (radii, angles).
 
-    Valid samples lie on usable pixels, from the radius [px] on.
+    Also returns the samples on usable pixels from the radius [px] on, and those on free ones, bool.
     """
     corners = np.array([(y, x) for y in (0, data.shape[0] - 1) for x in (0, data.shape[1] - 1)])
     end = int(np.ceil(np.hypot(*(corners - place).T).max())) + 1
@@ -313,8 +312,11 @@ def _rays(data, usable, place, radius):
     angles, radii = np.arange(n_angles) * 2 * np.pi / n_angles, np.arange(end + 1.0)[:, None]
     at = [place[0] + radii * np.sin(angles), place[1] + radii * np.cos(angles)]
     rays = map_coordinates(np.where(usable, data, 0.0), at, order=1, mode="constant")
-    seen = map_coordinates(usable.astype(float), at, order=1, mode="constant")
-    return rays, (seen > MIN_USABLE_WEIGHT) & (radii >= radius)
+    seen, free = (
+        map_coordinates(pixels.astype(float), at, order=1, mode="constant") > MIN_USABLE_WEIGHT
+        for pixels in (usable, free)
+    )
+    return rays, seen & (radii >= radius), free
 
 
 def _scale(psf, band, profile, radius):
@@ -345,18 +347,18 @@ def _amplitude(psf, band, data, chosen, place):
     return float(light @ data[chosen] / power) if power > 0 else None
 
 
-def _lasting(rest, known, light, first, fwhm):
+def _lasting(rest, known, hidden, light, first, fwhm):
     """Light above the mean that persists along rays: (radii, angles + 1), first angle repeated.
 
-    rest, known (radii, angles): light above the mean, and its valid samples
+    rest (radii, angles): light above the mean; known, hidden: its valid samples, and those of the
+        light of listed sources, bool
     light (radii,) [sigma]: the mean
     first: number of the core's last ring, within which the result falls to 0
     """
     half = rest.shape[1] // 2
-    opposite, opposite_known = np.roll(rest, half, axis=1), np.roll(known, half, axis=1)
-    rest = np.where(known, rest, opposite)
-    known = known | opposite_known
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    behind = hidden & np.roll(known, half, axis=1)
+    rest = np.where(behind, np.roll(rest, half, axis=1), rest)
+    nearest = distance_transform_edt(~(known | behind), return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
     lasting = np.zeros_like(rest)
     for least, length in MEDIANS_FWHM.items():

@@ -228,9 +228,9 @@ class ProfileFit:
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        prior, source = self.population, self.source[scenes]
-        given = normal, spectra, source, prior.stars[scenes], prior.own_light[scenes]
-        prior.set_contamination(scenes, contamination_factors(*given))
+        prior = (a[scenes] for a in (self.source, self.population.stars, self.population.own_light))
+        factors = contamination_factors(normal, spectra, *prior)
+        self.population.set_contamination(scenes, factors)
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some of the scenes rendered last."""
