@@ -71,10 +71,7 @@ class ProfileFit:
         self._measure_brightness(self.theta)  # now with spectra
 
     def run(self):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways.
-
-        Then sets size and wings of faint galaxies from grids.
-        """
+        """Steps to the end, from two starts if galaxies are large; sets faint ones from grids."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
         self._step(np.flatnonzero(some), learn=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
