@@ -17,7 +17,7 @@ from .linear.rendered_models import MorphologyModel, RenderedModel, render_model
 from .posterior.posterior import with_errors
 from .result import Component, Result
 from .solver.scene import ComponentStructure, image_numbers, signature_of
-from .start.carried_structure import carry_structure, with_kept_boxes, with_structure
+from .start.carried_structure import carry_structure
 from .start.first_scene import first_scene
 from .start.profile_start import (
     LIGHT_SIGMAS,
@@ -92,8 +92,7 @@ class Fit:
         thetas = self.blend.thetas if len(self.blend.thetas) else [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
         positions, observations = self._positions[i], self.blend.observations
-        given = self.frame, sources, positions, self.views, tuple(thetas), observations
-        return StartInput(*given, with_structure(self))
+        return StartInput(self.frame, sources, positions, self.views, tuple(thetas), observations)
 
     @property
     def signature(self):
@@ -110,7 +109,6 @@ class Fit:
         """Makes the scene and its state from the starting point; seconds: the time of the start."""
         began = time.perf_counter()
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
-        self.start = with_kept_boxes(self)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
         self._first_shifts, self._going_on = self.shifts, None
@@ -209,7 +207,7 @@ def start_fits(fits):
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
         fit.begin(point, seconds)
-    carry_structure(fits)
+    carry_structure([fit for fit in fits if fit.blend.structures])
 
 
 def render_fits(fits) -> list[RenderedModel]:

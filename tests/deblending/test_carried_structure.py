@@ -25,7 +25,6 @@ from clresample.deblending.start.carried_structure import (
 
 PRIOR = MultiscalePrior()
 GALAXY = (22.0, 24.0), (1800, 1600, 1400), 3.5
-OTHER = (34.0, 10.0), (300, 500, 400), 2.0
 CLUMPS = [((22.0 + dy, 24.0 + dx), (90, 80, 70), 1.0) for dy, dx in ((6, 2), (-3, 5), (1, -6))]
 
 
@@ -38,9 +37,9 @@ def test_the_morphology_of_coefficients_is_the_solvers():
     assert abs(found - profile).max() > 0.05
 
 
-@pytest.mark.parametrize("move", [(0, 0), (-4, 8)])
-def test_structure_moves_with_its_pixels(move):
-    """By steps of the lattices; beyond the former box it is 0."""
+@pytest.mark.parametrize("move, atol", [((0, 0), 1e-5), ((-4, 8), 1e-5), ((-3, 2), 0.02)])
+def test_structure_moves_with_its_pixels(move, atol):
+    """By steps of the lattices exactly, else nearly; beyond the former box it is 0."""
     shape, larger = (40, 48), (60, 70)
 
     def image(box, origin, z):
@@ -61,7 +60,7 @@ def test_structure_moves_with_its_pixels(move):
     inside = np.zeros((120, 120), bool)
     inside[origin[0] : 70, origin[1] : 78] = True
     inside[:36, :] = inside[:, :42] = False
-    assert abs(found - wanted)[inside].max() < 1e-5 * wanted.max()
+    assert abs(found - wanted)[inside].max() < atol * wanted.max()
 
 
 def test_structure_is_for_the_component_that_had_it():
@@ -97,7 +96,7 @@ def test_structure_is_for_the_component_that_had_it():
 @pytest.fixture(scope="module")
 def ended(device):
     """A blend of a galaxy with clumps and a neighbour, and its fit."""
-    scene = blend([GALAXY, OTHER, *CLUMPS], shape=(48, 48), seed=3)
+    scene = blend([GALAXY, ((34.0, 10.0), (300, 500, 400), 2.0), *CLUMPS], shape=(48, 48), seed=3)
     sources = tuple(replace(source, n_components=1) for source in scene.sources[:2])
     scene = replace(scene, sources=sources)
     return scene, deblend_many([scene], device=device)[0]
@@ -112,42 +111,6 @@ def test_a_fit_goes_on_where_another_ended(ended, device):
     assert again.converged and 3 * len(again.losses) < len(first.losses)
     assert again.losses[0] < first.losses[-1] + 1 < 0.1 * first.losses[0]
     assert again.losses[-1] < first.losses[-1] + 0.1
-    np.testing.assert_array_equal(again.thetas[0], first.thetas[0])
-
-
-def test_profiles_stay_where_their_structure_is_known(ended, device):
-    """Beside a source that is new; all move where there is no structure to go on from."""
-    scene, first = ended
-    position, *_ = CLUMPS[0]
-    more = replace(scene.sources[0], position_px=position)
-    given = {"sources": (*scene.sources, more), "thetas": (*first.thetas, None)}
-    begun = {}
-    for known in ((*first.structures, None), ()):
-        one = Fit(replace(scene, **given, structures=known), Settings(), device, np.float32, pad=1)
-        start_fits([one])
-        begun[bool(known)] = np.array(one.start.thetas)
-        (mean,) = (s.mean for s in one.start.shapes[-1:])
-        assert abs(one.start.thetas[-1] - mean).max() > 0.01
-    before = np.concatenate(first.thetas)
-    np.testing.assert_array_equal(begun[True][:2], before)
-    assert (abs(begun[False][:2] - before).max(axis=1) > 1e-3).all()
-
-
-@pytest.mark.parametrize("part", [0.02, 50.0])
-def test_boxes_hold_those_of_the_earlier_fit(ended, device, part):
-    """They begin a multiple of the steps away, whatever light the profile has at the start."""
-    scene, first = ended
-    objects = [(p, tuple(part * f for f in fluxes), size) for p, fluxes, size in (GALAXY, OTHER)]
-    seen = blend(objects, shape=(48, 48), seed=3).observations
-    given = {"observations": seen, "thetas": first.thetas, "structures": first.structures}
-    (fit,) = fits = [Fit(replace(scene, **given), Settings(), device, np.float32, pad=1)]
-    start_fits(fits)
-    for (known,), origin, morph in zip(
-        first.structures, fit.scene.origin, fit.state.morph, strict=True
-    ):
-        away, end = np.array(known.origin) - origin, known.coefficients[0].shape
-        assert (away % max(PRIOR.steps) == 0).all() and (away >= 0).all()
-        assert (away + end <= morph.shape).all() and (part > 1 or (away + end == morph.shape).all())
 
 
 def test_a_fit_that_starts_again_does_so_from_the_structure(ended, device):

@@ -97,23 +97,21 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pi
     """In fewer trials, with the doubt of large galaxies from the first on.
 
     Second starts are of scenes whose galaxies grow beyond their earlier and their expected size,
-    and of unexplained ones without an earlier fit. What is held stays, and has no second start.
+    and of unexplained ones without an earlier fit.
     """
-    fit, looking = valley([1.9, 1.9, 3.4, 0.5, 1.9, 0.5, 3.4])
+    fit, looking = valley([1.9, 1.9, 3.4, 0.5, 1.9, 0.5])
     begun: list[int] = []
-    monkeypatch.setattr(looking, "n_pixels", lambda: np.full(7, n_pixels))
-    monkeypatch.setattr(fit.expected, "galaxies", np.ones((7, 1), bool))
+    monkeypatch.setattr(looking, "n_pixels", lambda: np.full(6, n_pixels))
+    monkeypatch.setattr(fit.expected, "galaxies", np.ones((6, 1), bool))
     monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: begun.extend(scenes))
     before = looking.n_looks.copy()
-    known = {i: [size, 0, 0, 0] for i, size in ((0, 1.8), (2, 1.8), (3, -1.5), (6, 1.8))}
-    profile_fit.start_from(fit, known, [6])
+    profile_fit.start_from(fit, {0: [1.8, 0, 0, 0], 2: [1.8, 0, 0, 0], 3: [-1.5, 0, 0, 0]})
     fit.run()
-    np.testing.assert_allclose(fit.theta[:6, 0, 0], looking.goals[:6], atol=0.01)
-    assert fit.theta[6, 0, 0] == 1.8
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
     n_trials = looking.n_looks - before
     assert n_trials[0] < n_trials[1] and begun == again
-    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, OWN_LIGHT, 0, 0, 0, OWN_LIGHT]
-    assert fit.is_known.tolist() == [True, False, True, True, False, False, True]
+    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, OWN_LIGHT, 0, 0, 0]
+    assert fit.is_known.tolist() == [True, False, True, True, False, False]
 
 
 def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):

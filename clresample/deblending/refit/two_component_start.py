@@ -87,7 +87,7 @@ def _together(fit, chosen):
         elif len(own) == 1 and isinstance(begin.shapes[own[0]], GalaxyProfile):
             profile = begin.drawn(own[0], (0, 0), fit.frame.shape)
             sources[i] = replace(source, profile=profile, n_components=None)
-    return replace(fit.patch, sources=sources, thetas=thetas, held=None)
+    return replace(fit.patch, sources=sources, thetas=thetas)
 
 
 def _split(theta):
@@ -157,8 +157,7 @@ def _joined(begin, point, chosen):
         name: np.array(parts[name])
         for name in ("drawn_positions", "peaks", "spectra", "spectrum_curvature")
     }
-    boxes = tuple(p.kept_box(k) for p, k in order)
-    return replace(begin, source=np.array(source), kept_boxes=boxes, **(parts | arrays))
+    return replace(begin, source=np.array(source), **(parts | arrays))
 
 
 def _with_cores(fit, asked):
@@ -182,7 +181,6 @@ def _with_cores(fit, asked):
         peaks=peaks,
         spectra=begin.spectra[before],
         spectrum_curvature=power,
-        kept_boxes=tuple(None if k else begin.kept_box(i) for i, k in zip(before, new)),
     )
 
 

@@ -49,8 +49,6 @@ def box_around(profile, position, brightness):
 def component_box(start, i, frame, brightness):
     """`box_around` of a component that a start has found, and its profile there (ny, nx), max = 1.
 
-    Where there is a box of an earlier fit, it contains that one and begins a multiple of its step
-    away from it, so that coefficients of structure keep their pixels.
     start: StartingPoint; i: which component; frame (2,) [px]: the frame's shape
     """
     middle, half = start.reach(i, box_threshold(brightness))
@@ -61,10 +59,4 @@ def component_box(start, i, frame, brightness):
     high = np.minimum(np.ceil(high), top).astype(int)
     image = start.drawn(i, low, high - low)
     inside, size, center = box_around(image, place - low, brightness)
-    kept = start.kept_box(i)
-    if kept is None:
-        return low + inside, size, center, image[box_slices(inside, size)]
-    low, center, (box, step) = low + inside, low + inside + center, kept
-    high, before = np.maximum(low + size, box[2:]), np.array(box[:2])
-    low = before + step * np.maximum(np.minimum((low - before) // step, 0), -(before // step))
-    return low, high - low, center - low, start.drawn(i, low, high - low)
+    return low + inside, size, center, image[box_slices(inside, size)]

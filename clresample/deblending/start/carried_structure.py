@@ -6,38 +6,13 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from ...sky.box import Box, intersect_boxes
-from ...sky.sources import PointSource
 from ..solver.multiscale.prior import MultiscalePrior, kernel_rows, without_profile
 from ..solver.multiscale.structure import coarse_count, no_structure
-from ..solver.scene import ComponentStructure, StructureState
+from ..solver.scene import StructureState
 from .first_scene import best_starts
 from .profile_start import by_size
-
-
-def with_kept_boxes(fit):
-    """The StartingPoint of a Fit whose components with known structure keep its boxes.
-
-    A start of smooth profiles may give a component less light than it had with structure, and a
-    smaller box: of two similar components of a galaxy it often has one alone.
-    """
-    boxes: list[tuple[Box, int] | None] = [None] * len(fit.start)
-    for k, one in _of_components(fit).items():
-        steps = fit.settings.prior.steps
-        finest, low = np.argmin(steps), np.array(one.origin)
-        high = low + (np.array(one.coefficients[finest].shape) - 1) * steps[finest] + 1
-        box = Box(*low.tolist(), *np.minimum(high, fit.frame.shape).tolist())
-        boxes[k] = box, max(steps)
-    return replace(fit.start, kept_boxes=tuple(boxes))
-
-
-def with_structure(fit):
-    """Selects the sources (n,) inside a Fit's frame that have structure to go on from."""
-    if not _takes_structure(fit):
-        return np.zeros(len(fit.fitted), bool)
-    given = [fit.blend.structures[i] or (None,) for i in fit.fitted]
-    return np.array([all(one is not None for one in own) for own in given])
 
 
 def carry_structure(fits):
@@ -50,21 +25,16 @@ def carry_structure(fits):
     """
     starts = []
     for fit in fits:
-        known = _of_components(fit)
-        if known:
-            going_on = copy(fit)
-            going_on.state = _with_structure(fit, known)
-            starts.append((fit, going_on))
+        if isinstance(getattr(fit.settings, "prior", None), MultiscalePrior):
+            known = _of_components(fit)
+            if known:
+                going_on = copy(fit)
+                going_on.state = _with_structure(fit, known)
+                starts.append((fit, going_on))
     if starts:
         best = best_starts(starts, fits[0].settings.fit_sky)
         for (fit, _), chosen in zip(starts, best, strict=True):
             fit.go_on_from(chosen.state)
-
-
-def _takes_structure(fit):
-    """Returns True for a Fit with a MultiscalePrior and given structures."""
-    prior = getattr(fit.settings, "prior", None)
-    return bool(fit.blend.structures) and isinstance(prior, MultiscalePrior)
 
 
 def _of_components(fit):
@@ -72,17 +42,14 @@ def _of_components(fit):
 
     Of several the most compact one is first, as in the start's profiles.
     """
-    known: dict[int, ComponentStructure] = {}
-    if not _takes_structure(fit):
-        return known
-    n_scales = len(fit.settings.prior.steps)
+    known, n_scales = {}, len(fit.settings.prior.steps)
     for i in np.unique(fit.start.source):
         places, at = np.flatnonzero(fit.start.source == i), fit.fitted[i]
         given, thetas = fit.blend.structures[at] or (), fit.blend.thetas[at] or ()
         if not len(places) == len(given) == len(thetas):
             continue
         for k, one in zip(places.tolist(), (given[j] for j in by_size(thetas)), strict=True):
-            if one is not None and not isinstance(fit.sources[at], PointSource):
+            if one is not None and not fit.scene.fixed[k]:
                 if len(one.coefficients) != n_scales:
                     raise ValueError(
                         f"structures[{at}] has {len(one.coefficients)} scales, the prior has "
@@ -111,14 +78,15 @@ def _with_structure(fit, known):
 def moved_structure(known, origin, shape, prior):
     """Coefficients (J) of a ComponentStructure in a box of a shape from another origin [px] on.
 
-    They are 0 beyond the former box, which begins a multiple of the prior's steps away.
+    They are interpolated by cubic splines where the lattices differ, and 0 beyond the former box.
     """
     moved = []
     for z, step in zip(known.coefficients, prior.steps, strict=True):
-        away = (np.array(known.origin) - origin) // step
-        moved.append(np.zeros(coarse_count(shape, step)))
-        here, there = intersect_boxes((0, 0), moved[-1].shape, away, z.shape)
-        moved[-1][here] = z[there]
+        at = [
+            (new - old) / step + np.arange(coarse_count(n, step))
+            for new, old, n in zip(origin, known.origin, shape, strict=True)
+        ]
+        moved.append(map_coordinates(z.astype(float), np.meshgrid(*at, indexing="ij"), order=3))
     return moved
 
 

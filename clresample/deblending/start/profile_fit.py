@@ -44,7 +44,6 @@ class ProfileFit:
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
-    held (B, n): components that keep the parameters of an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
@@ -64,7 +63,6 @@ class ProfileFit:
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
-        self.held = np.zeros(size[:2], bool)
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -77,18 +75,15 @@ class ProfileFit:
         self._measure_brightness(self.theta)  # now with spectra
 
     def run(self):
-        """Steps until all scenes have ended; starts those with large galaxies in two ways.
-
-        Then sets size and wings of faint galaxies from grids.
-        """
-        some = np.unique(self.looking.scene[self.counts > 0])
-        self._step(some, learn=True)
+        """Steps to the end, from two starts if galaxies are large; sets faint ones from grids."""
+        some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
+        self._step(np.flatnonzero(some), learn=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             self._run_from_large_galaxies(scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
-        fit_faint_shapes(self, some)
+        fit_faint_shapes(self, np.flatnonzero(some))
 
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
@@ -166,8 +161,8 @@ class ProfileFit:
         """
         learning = np.full(len(self.theta), learn)
         steps = StepControl(len(self.theta))
-        free = (self.source >= 0) & ~self.held if free is None else free
-        live = np.isin(np.arange(len(self.theta)), scenes) & free.any(axis=1)
+        live = np.isin(np.arange(len(self.theta)), scenes)
+        free = np.ones(self.source.shape, bool) if free is None else free
         for i_step in range(n_steps):
             scenes = np.flatnonzero(live)
             given = *self._equations(scenes), self.population.galaxies[scenes], free[scenes]
@@ -262,17 +257,13 @@ class ProfileFit:
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
 
 
-def start_from(fit, known, held):
-    """Sets parameters of an earlier fit {component: (n,)} in a ProfileFit; solves their scenes.
-
-    held: components that keep them
-    """
+def start_from(fit, known):
+    """Sets parameters of an earlier fit {component: (n,)} in a ProfileFit; solves their scenes."""
     galaxies = [i for i in known if fit.counts[i]]
     for i in galaxies:
         fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
     scenes = np.unique(fit.looking.scene[galaxies])
     grown = _growth(fit)[scenes].max(axis=1) > MAX_GROWTH
-    fit.held[fit.looking.scene[held], fit.looking.index[held]] = True
     fit.is_known[scenes], fit.begun = True, np.maximum(fit.theta, fit.begun)
     fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
@@ -288,12 +279,10 @@ def _may_hold_large_galaxies(fit):
     """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained.
 
     Galaxies of an earlier fit, which has looked for larger ones, count if they have grown since. It
-    leaves structure to be fitted, so that its smooth profiles never explain all of the data. Scenes
-    of which some are held have one start.
+    leaves structure to be fitted, so that its smooth profiles never explain all of the data.
     """
     unexplained = (fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()) & ~fit.is_known
-    grown = _growth(fit, fit.begun).max(axis=1) > MAX_GROWTH
-    return (grown | unexplained) & ~fit.held.any(axis=1)
+    return (_growth(fit, fit.begun).max(axis=1) > MAX_GROWTH) | unexplained
 
 
 def _chi2_as_expected(fit, scenes):

@@ -22,7 +22,6 @@ import numpy as np
 
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
-from ...sky.box import Box
 from ...sky.frame import Frame
 from ...sky.sources import PointSource
 from ..linear.component_batch import StartComponent, renumbered
@@ -52,7 +51,6 @@ class StartInput:
     thetas (S): for each source None, or the parameters (n,) of each of its components, from which
         it starts; (): None for all
     observations: those of the views, for the PSFs of stars; (): stars of the model's PSF alone
-    held (S,): sources that keep these parameters, about which their structure is known; None: none
     """
 
     frame: Frame
@@ -61,7 +59,6 @@ class StartInput:
     views: list[WhitenedView]
     thetas: tuple = ()
     observations: tuple = ()
-    held: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +74,6 @@ class StartingPoint:
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
     flux_scatter (S, C): of the sources' fluxes by size and wings, see ProfileFit
-    kept_boxes (n): for each component None, or the Box of an earlier fit and its step [px], see
-        `component_box`; (): None for all
     """
 
     source: np.ndarray
@@ -92,7 +87,6 @@ class StartingPoint:
     sky: np.ndarray
     spectrum_curvature: np.ndarray
     flux_scatter: np.ndarray | float = 0.0
-    kept_boxes: tuple[tuple[Box, int] | None, ...] = ()
 
     def __len__(self):
         return len(self.shapes)
@@ -109,10 +103,6 @@ class StartingPoint:
             self.thetas[i], self.drawn_positions[i], origin, size, slopes=False
         )
         return image[0] / self.peaks[i]
-
-    def kept_box(self, i) -> tuple[Box, int] | None:
-        """The Box in the frame that component i had in an earlier fit, and its step [px]."""
-        return self.kept_boxes[i] if self.kept_boxes else None
 
     def reach(self, i, threshold):
         """Middle (2,) and half size (2,) [px] of component i above a fraction of its peak."""
@@ -132,8 +122,7 @@ def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[Star
     fit = ProfileFit(looking, noise)
     fit.begin()
     dark = _dark(patches, sources, looking)
-    known = _known(patches, components)
-    start_from(fit, known, [i for i in known if _is_held(patches, components[i])])
+    start_from(fit, _known(patches, components))
     fit.run()
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
@@ -245,12 +234,6 @@ def _known(patches, components):
         if [len(theta) for theta in before] == sizes:
             known |= dict(zip(places, before, strict=True))
     return known
-
-
-def _is_held(patches, component):
-    """Returns True if a component of known parameters keeps them."""
-    held = patches[component.scene].held
-    return held is not None and bool(held[component.source])
 
 
 def _dark(patches, sources, looking):

@@ -57,8 +57,7 @@ def fit_faint_shapes(fit, scenes):
     Stores the scatter of their fluxes in its `flux_scatter`.
     """
     grids = _grids(fit, _uncertain(fit, scenes))
-    free = {i: grid for i, grid in grids.items() if not fit.held[grid.scene, grid.index]}
-    better = {i: grid.theta[k] for i, grid in free.items() if (k := grid.best(fit))}
+    better = {i: grid.theta[k] for i, grid in grids.items() if (k := grid.best(fit))}
     if better:
         changed = _fitted_again(fit, better)
         grids |= _grids(fit, [i for i in grids if fit.looking.scene[i] in changed])
@@ -104,7 +103,7 @@ class ShapeGrid:
         prior = (1 - UNUSUAL) * usual + unusual
         weight = np.exp((gain - gain.max()) / (2 * self.contamination(fit))) * prior
         weight /= weight.sum()
-        moves = weight @ (unusual / prior) > MIN_UNUSUAL and not fit.held[at[:2]]
+        moves = weight @ (unusual / prior) > MIN_UNUSUAL
         found, about = (weight @ theta, weight @ flux) if moves else (self.theta[0], self.flux[0])
         return found, np.sqrt(weight @ np.square(flux - about))
 
