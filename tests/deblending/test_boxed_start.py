@@ -72,6 +72,30 @@ def test_slopes_of_chi2(device, monkeypatch):
         assert slope == pytest.approx(-2 * right[i], rel=1e-5), i
 
 
+def test_held_profiles_have_no_slopes_and_leave_those_of_others(device):
+    """In whatever place: the equations of what moves are as if all moved."""
+    star = PointSource(position_px=(8, 28), free_position=True)
+    observations = observe((*GALAXIES, ((8.3, 27.8), FLUX, 0)))
+    fit = profile_fit_of(device, (*sources(), star), observations, fit_sky=True)
+    fit.begin()
+    fit._take(np.arange(1))  # in the boxes of their light
+    whole, right = fit.normal[0], fit.right[0].copy()
+    for held in ([0], [1, 2]):
+        fit.moves[0] = ~np.isin(np.arange(fit.moves.shape[1]), held)
+        fit._take(np.arange(1))
+        moves = np.repeat(fit.moves[0], 4)
+        slots = fit.looking.slots
+        drawn = dict(zip(fit.looking.at.tolist(), slots.n_images.tolist(), strict=True))
+        assert all((drawn[i] == 1) == (i in held) for i in drawn)
+        assert not fit.normal[0][~moves].any() and not fit.right[0][~moves].any()
+        scale = np.abs(np.diagonal(whole)[moves])
+        change = fit.normal[0][np.ix_(moves, moves)] - whole[np.ix_(moves, moves)]
+        assert np.all(np.abs(change) <= 1e-4 * np.sqrt(scale[:, None] * scale))
+        np.testing.assert_allclose(
+            fit.right[0][moves], right[moves], atol=1e-3 * np.sqrt(scale.max())
+        )
+
+
 @pytest.mark.parametrize("angle", [0, 25, 90])
 @pytest.mark.parametrize("fit_sky", [False, True])
 def test_normal_matrices_are_those_of_whole_frames(device, angle, fit_sky):

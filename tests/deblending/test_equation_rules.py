@@ -96,7 +96,7 @@ def posed(monkeypatch):
     def slots(chosen, thetas, boxes, *, slopes):
         order = np.random.default_rng(3).permutation(len(chosen))
         numbers = [c.number for c in chosen]
-        counts = np.array([1 + PARTS[i][2] * slopes for i in numbers])[order]
+        counts = (1 + slopes * np.array([PARTS[i][2] for i in numbers]))[order]
         assert [len(t) for t in thetas] == [PARTS[i][2] for i in numbers]
         return Listed(
             order=order, numbers=numbers, n_images=counts, draw=lambda *_: None, boxes=boxes

@@ -27,7 +27,7 @@ class Valley:
         self.n_looks = np.zeros(n, int)
 
     def render(self, scenes, thetas, _brightness, *, slopes):
-        assert slopes  # a trial that gains is the next one's beginning
+        assert slopes.all()  # a trial that gains is the next one's beginning
         self.scenes, self.now = np.asarray(scenes), np.array([t[0] for t in thetas])
         self.n_looks[self.scenes] += 1
 

@@ -118,7 +118,7 @@ class ComponentBatch:
     """Components drawn side by side; those of equal boxes and scenes follow each other.
 
     components (n): any; thetas (n): their parameters; boxes (n): (origin, size); slopes: True to
-        draw slopes with the profiles
+        draw slopes with the profiles, or bool (n,) for each
 
     order (n,): the components in the order of the slots; scene, n_images (n,), origin, size (n, 2),
     begin (n,): first element of each slot's images in the device array that `draw` returns
@@ -127,11 +127,11 @@ class ComponentBatch:
     def __init__(self, components, thetas, boxes, *, slopes):
         scene = np.array([c.scene for c in components])
         origin, size = (np.array([box[k] for box in boxes]).reshape(-1, 2) for k in (0, 1))
-        count = np.array([1 + len(theta) * slopes for theta in thetas])
+        count = 1 + slopes * np.array([len(theta) for theta in thetas])
         self.order = order = np.lexsort((scene, count, size[:, 1], size[:, 0]))
         self.components = [components[i] for i in order]
         self.thetas = [thetas[i] for i in order]
-        self.scene, self.n_images, self.slopes = scene[order], count[order], slopes
+        self.scene, self.n_images = scene[order], count[order]
         self.origin, self.size = origin[order], size[order]
         self.begin, self.n_elements = cumulative_offsets(self.n_images * self.size.prod(axis=1))
         self._lists = {}
@@ -170,7 +170,7 @@ class ComponentBatch:
             cut = kept.get(key)
             if cut is None:
                 box = self.origin[i], self.size[i]
-                cut = c.shape.draw_box(theta, c.position, *box, slopes=self.slopes)
+                cut = c.shape.draw_box(theta, c.position, *box, slopes=self.n_images[i] > 1)
                 cut = np.ascontiguousarray(cut, dtype)
             if not len(theta):
                 kept[key] = cut

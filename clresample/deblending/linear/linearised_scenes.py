@@ -61,13 +61,14 @@ class LinearisedScenes:
     def render(self, scenes, thetas, brightness, *, slopes, whiten=True):
         """Draws and renders the components of some scenes (k,).
 
-        thetas (N): arrays; brightness (N,): see `profile_thresholds`; whiten: else `whiten` is to
-            follow
+        thetas (N): arrays; brightness (N,): see `profile_thresholds`; slopes: True to draw them
+            too, or bool (N,) for each; whiten: else `whiten` is to follow
         """
         self.scenes = np.asarray(scenes)
         at = np.flatnonzero(np.isin(self.scene, self.scenes))
         chosen, theta = [self.components[i] for i in at], [thetas[i] for i in at]
         boxes = boxes_of(chosen, theta, profile_thresholds(brightness[at]))
+        slopes = np.broadcast_to(slopes, len(self.components))[at]
         self.slots = ComponentBatch(chosen, theta, boxes, slopes=slopes)
         self.at = at[self.slots.order]
         self._row = np.full(self.n_scenes, -1)

@@ -41,6 +41,7 @@ class ProfileFit:
 
     expected, population: PopulationPriors on the parameters, the first and the present one
     source (B, n): to which each component belongs, -1 where there is none
+    moves (B, n): bool, those whose parameters are fitted; others are drawn without slopes
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
@@ -63,6 +64,7 @@ class ProfileFit:
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
+        self.moves = np.ones(size[:2], bool)
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -133,12 +135,11 @@ class ProfileFit:
         here = [i for i in thetas if self.looking.scene[i] in scenes]
         part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
         fit = ProfileFit(part, self.noise)
-        moves = np.zeros(fit.source.shape, bool)
         for b, k, i in zip(*fit.at, here, strict=True):
             fit.theta[b, k, : len(thetas[i])] = thetas[i]
-            moves[b, k] = i in free
+            fit.moves[b, k] = i in free
         fit._take(scenes)
-        fit._step(scenes, moves, N_FIRST_STEPS)
+        fit._step(scenes, N_FIRST_STEPS, NEED)
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes, *, doubt=True):
@@ -152,8 +153,8 @@ class ProfileFit:
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
-    def _step(self, scenes, free=None, n_steps=N_STEPS, *, learn=False):
-        """Step until some scenes have ended; free (B, n): the components that move.
+    def _step(self, scenes, n_steps=N_STEPS, tol=CHI2_TOL, *, learn=False):
+        """Step until some scenes have ended; tol: least gain in chi2, measured or expected.
 
         learn: update the prior after each step, of each scene until that takes back what the step
         gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
@@ -162,19 +163,18 @@ class ProfileFit:
         learning = np.full(len(self.theta), learn)
         steps = StepControl(len(self.theta))
         live = np.isin(np.arange(len(self.theta)), scenes)
-        free = np.ones(self.source.shape, bool) if free is None else free
         for i_step in range(n_steps):
             scenes = np.flatnonzero(live)
-            given = *self._equations(scenes), self.population.galaxies[scenes], free[scenes]
+            given = *self._equations(scenes), self.population.galaxies[scenes], self.moves[scenes]
             trial, expected, promised = steps.next(scenes, *given)
-            on = expected >= CHI2_TOL
+            on = expected >= tol
             live[scenes[~on]] = False
             scenes = scenes[on]
             if not len(scenes):
                 break
             gain = self._try(scenes, trial[on])
             gained = gain > 0
-            small = (gain < CHI2_TOL) & (promised[on] < MAX_SHORTFALL * CHI2_TOL)
+            small = (gain < tol) & (promised[on] < MAX_SHORTFALL * tol)
             live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & small)
             if gained.any():
                 self._take_equations(scenes[gained])
@@ -203,6 +203,7 @@ class ProfileFit:
         return gain
 
     def _look(self, scenes, theta, *, slopes):
+        slopes = slopes & self.moves[self.at]
         self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
     def _chi2(self, scenes, theta):
