@@ -247,7 +247,7 @@ class Solution:
 def _combine(images, keep, weights, out):
     """Writes combinations of the images `keep`, weights (k, k) 0 above the diagonal, to `out`."""
     if len(keep):
-        np.take(images, keep, axis=0, out=out)
+        np.take(images, keep, axis=0, out=out, mode="clip")  # others take a copy first
         # the transpose, since BLAS counts rows first; in place
         flat = out.reshape(len(out), -1)
         strmm(1.0, weights.astype(np.float32).T, flat.T, side=1, overwrite_b=1)

@@ -128,15 +128,6 @@ class SourceEvidence:
         """The preconditioner's curvature (J,) of each scale, where the blurred light is 1."""
         return self._mean_weights @ self.sharpness(spectrum)
 
-    def cross_lags(self, spectrum):
-        """K_i^T T K_j (J, J, n, n) of coefficients of two scales by their distance, 0 first."""
-        n, plane = N_FREQUENCIES, self.spectra.k_plane
-        root = np.sqrt(plane)
-        power = root[:, None] * root * self.sharpness(spectrum).reshape(plane.shape[1:])
-        lags = np.fft.irfft2(power, (n, n)).astype(np.float32)
-        lags[..., n // 2, :] = lags[..., n // 2] = 0  # and all larger ones
-        return lags
-
     def determined(self, strengths, spectrum):
         """gamma (J,): parameters that the data determine at each scale."""
         w = np.square(strengths)[:, None] * self.spectra.k * self.sharpness(spectrum)

@@ -10,18 +10,12 @@ T_c (evidence.py) is used for the whole box. A source of many coefficients has a
 of its box, to which blocks of its coarser scales, which extend further, are added. The inverse is
 then wrong by a factor of a hundred for its widest waves, and without these by thousands. Other
 sources, edges and the spectra are not in the blocks; L-BFGS accounts for them. Such a source also
-has a ScaleDirection, see scale_direction.py, and its profile varies little over a coefficient, but
-in its core: without the part along p, U^T T U of its other blocks then has the elements
-
-    e_a e_b (K_i^T T K_j)(x_a - x_b),    e_a^2 = sum K_a^2 p
-
-of coefficients a of scale i and b of scale j, from a table of distances. All are computed in NumPy
-on the host, at the start and after updates of strengths.
+has a ScaleDirection, see scale_direction.py. All are computed in NumPy on the host, at the start
+and after updates of strengths.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +47,8 @@ MANY_PIXELS, TOGETHER = 1200, 32
 # A block uses the pixels where one of its coefficients has more than this fraction of its largest
 # value. It is recomputed if the logarithm of a strength, or the spectrum relative to its largest
 # value, has changed by more than CHANGE: with 0.35 fits of simulated scenes take a tenth more time
-# and equally many rounds; with 2, some more rounds. Those of a source of several blocks take a
-# quarter of that time and are recomputed after LOCAL_CHANGE: giants (bench.ladder) take 125 rounds
-# in place of 158, with CHANGE 170.
-MIN_RELATIVE_SIZE, CHANGE, LOCAL_CHANGE = 0.1, 1.0, 0.3
+# and equally many rounds; with 2, some more rounds.
+MIN_RELATIVE_SIZE, CHANGE = 0.1, 1.0
 # Rows of a factor that are stored with one length, for a CPU's vectors.
 PANEL = 8
 
@@ -111,9 +103,8 @@ class BlockPreconditioner:
 
     def _moved(self, strengths, spectrum):
         before = self._at
-        change = CHANGE if self._blocks.direction is None else LOCAL_CHANGE
-        more = np.abs(spectrum - before[1]).max() > change * np.abs(before[1]).max()
-        return more or np.abs(np.log(strengths / before[0])).max() > change
+        more = np.abs(spectrum - before[1]).max() > CHANGE * np.abs(before[1]).max()
+        return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
 
     def _made(self, strengths, spectrum):
         """The SourceBlocks at these strengths and spectrum."""
@@ -123,20 +114,17 @@ class BlockPreconditioner:
         ]
         scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
         rows = np.column_stack([scale, np.concatenate(heard)])
-        is_split, found = len(rows) > MAX_BLOCK_SIZE, []
-        lags = self._evidence.cross_lags(spectrum) if is_split else None
+        steps, found = np.array(self._evidence.prior.steps), []
         for level in range(len(heard)):
-            parts = _split(rows, self._positions(rows))
+            parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
             for own in parts:
-                local = is_split and not self._has_core(own)
-                curvature = (
-                    self._local_curvature(own, lags) if local else self._curvature(own, spectrum)
-                )
+                curvature = self._curvature(own, spectrum)
                 root = _root(curvature, strengths[own[:, 0]] ** -2)
                 found.append(CurvatureBlock(level, self._places(own), root))
             if len(parts) < 2:
                 break
             rows = rows[rows[:, 0] > rows[:, 0].min()]
+        is_split = sum(block.level == 0 for block in found) > 1
         direction = self._scale_direction(strengths, spectrum) if is_split else None
         return SourceBlocks(tuple(found), direction)
 
@@ -155,42 +143,12 @@ class BlockPreconditioner:
         scale, y, x = rows.T
         return first[scale] + y * width[scale] + x
 
-    def _positions(self, rows):
-        """Pixels (m, 2) of coefficients (m, 3) of scale, y, x."""
-        return rows[:, 1:] * np.array(self._evidence.prior.steps)[rows[:, :1]]
-
-    def _has_core(self, rows):
-        """Returns True if the profile's peak is among the pixels of coefficients (m, 3)."""
-        at = self._positions(rows)
-        peak = np.unravel_index(np.argmax(self._profile), self._profile.shape)
-        return bool(((at.min(0) <= peak) & (peak <= at.max(0))).all())
-
-    def _local_curvature(self, rows, lags):
-        """U^T T U (m, m) of coefficients (m, 3), of a profile that is constant over each of them.
-
-        lags (J, J, n, n): SourceEvidence.cross_lags
-        """
-        n, at, scale = N_FREQUENCIES, self._positions(rows).astype(np.int32), rows[:, 0]
-        y, x = (np.clip(a[:, None] - a, -n // 2, n // 2) % n for a in at.T)
-        between = lags.take(((scale[:, None] * len(lags) + scale) * n + y) * n + x)
-        size = self._sizes[self._places(rows)]
-        return size[:, None] * between * size
-
-    @functools.cached_property
-    def _sizes(self):
-        """Roots of the light under each squared kernel, of all coefficients."""
-        prior, p = self._evidence.prior, self._profile
-        sides = [
-            [np.square(kernel_rows(prior, j, n)) for n in p.shape] for j in range(len(self._light))
-        ]
-        return np.sqrt(np.concatenate([(y @ p @ x.T).ravel() for y, x in sides]))
-
     def _curvature(self, rows, spectrum):
         """U^T T U (m, m) of coefficients (m, 3), by scale, on binned pixels."""
         prior, scales = self._evidence.prior, np.unique(rows[:, 0])
         step = min(COARSEST, *(prior.steps[j] for j in scales))
         reach = max(prior.radii[j] for j in scales)
-        at = self._positions(rows)
+        at = rows[:, 1:] * np.array(prior.steps)[rows[:, :1]]
         low = np.maximum(at.min(0) - reach, 0)
         high = np.minimum(at.max(0) + reach + 1, self._profile.shape)
         while (-(-(high - low) // step)).prod() > MAX_PIXELS:
