@@ -245,9 +245,12 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     rays, seen, free = _rays(data - profile.at(away), image.usable[c], free, middle, radius)
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, seen & free, seen & ~free, light, int(np.ceil(radius)), fwhm)
-    # samples at the PSF's spacing about the star, over all of the image
-    step, low = psf.spacing, -middle
-    high = np.array([n_y - 1, n_x - 1]) - middle
+    # samples at the PSF's spacing about the star, over all of the image that its halo reaches
+    step, low, high = psf.spacing, -middle, np.array([n_y - 1, n_x - 1]) - middle
+    if keeps_core:
+        lit = np.flatnonzero(light > LIGHT_SIGMAS).max(initial=0)
+        reach = max(float(lit), radius + fwhm)
+        low, high = np.maximum(low, -reach), np.minimum(high, reach)
     y, x = (
         np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step
         for a, b in zip(low, high, strict=True)
