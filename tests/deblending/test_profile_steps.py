@@ -103,7 +103,8 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pi
     begun: list[int] = []
     monkeypatch.setattr(looking, "n_pixels", lambda: np.full(6, n_pixels))
     monkeypatch.setattr(fit.expected, "galaxies", np.ones((6, 1), bool))
-    monkeypatch.setattr(fit, "_run_from_large_galaxies", lambda scenes: begun.extend(scenes))
+    second_start = "_run_from_large_galaxies"
+    monkeypatch.setattr(profile_fit, second_start, lambda _, scenes: begun.extend(scenes))
     before = looking.n_looks.copy()
     profile_fit.start_from(fit, {0: [1.8, 0, 0, 0], 2: [1.8, 0, 0, 0], 3: [-1.5, 0, 0, 0]})
     fit.run()

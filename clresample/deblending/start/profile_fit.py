@@ -82,36 +82,10 @@ class ProfileFit:
         self._step(np.flatnonzero(some), learn=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
-            self._run_from_large_galaxies(scenes)
+            _run_from_large_galaxies(self, scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
         fit_faint_shapes(self, np.flatnonzero(some))
-
-    def _run_from_large_galaxies(self, scenes):
-        """Fits some scenes again from profiles of large galaxies; the better fit of each stays.
-
-        Scenes in which no larger profile has more of the light keep the first fit; where the large
-        galaxies are those that grew in it, or some of an earlier fit's, it goes on with less doubt.
-        """
-        before, chi2 = self._copy(), _chi2_as_expected(self, scenes)
-        grown = _growth(self)[scenes] > MIN_GROWTH
-        self.theta[scenes] = self.expected.mean[scenes]
-        self.population.reset(scenes, self.expected)
-        self.population.own_light[scenes] = OWN_LIGHT
-        self._look(scenes, self.theta, slopes=False)
-        self.looking.solve(MODEL_ERROR)
-        large = first_profiles(self, scenes, MODEL_ERROR)[scenes]
-        some, same = large.any(axis=1), (large == grown).all(axis=1)
-        same |= self.is_known[scenes] & (large <= grown).all(axis=1)
-        self._restore(before, scenes[same | ~some])
-        self.population.own_light[scenes[some]] = OWN_LIGHT
-        self._take(scenes[some])
-        self._step(scenes[some], learn=True)
-        worse = scenes[some & ~(_chi2_as_expected(self, scenes) < chi2)]
-        self._restore(before, worse)
-        self.population.own_light[worse] = OWN_LIGHT
-        self._take(worse)
-        self._step(worse, learn=True)
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
@@ -290,6 +264,34 @@ def _chi2_as_expected(fit, scenes):
     """Chi2 (k,) with the priors as they were before any scene was fitted."""
     learned = fit.population.penalty(scenes, fit.theta)
     return fit.chi2[scenes] - learned + fit.expected.penalty(scenes, fit.theta)
+
+
+def _run_from_large_galaxies(fit, scenes):
+    """Fits scenes (k,) of a ProfileFit again from profiles of large galaxies.
+
+    The better fit of each stays. Scenes in which no larger profile has more of the light keep the
+    first fit; where the large galaxies are those that grew in it, or some of an earlier fit's, it
+    goes on with less doubt.
+    """
+    before, chi2 = fit._copy(), _chi2_as_expected(fit, scenes)
+    grown = _growth(fit)[scenes] > MIN_GROWTH
+    fit.theta[scenes] = fit.expected.mean[scenes]
+    fit.population.reset(scenes, fit.expected)
+    fit.population.own_light[scenes] = OWN_LIGHT
+    fit._look(scenes, fit.theta, slopes=False)
+    fit.looking.solve(MODEL_ERROR)
+    large = first_profiles(fit, scenes, MODEL_ERROR)[scenes]
+    some, same = large.any(axis=1), (large == grown).all(axis=1)
+    same |= fit.is_known[scenes] & (large <= grown).all(axis=1)
+    fit._restore(before, scenes[same | ~some])
+    fit.population.own_light[scenes[some]] = OWN_LIGHT
+    fit._take(scenes[some])
+    fit._step(scenes[some], learn=True)
+    worse = scenes[some & ~(_chi2_as_expected(fit, scenes) < chi2)]
+    fit._restore(before, worse)
+    fit.population.own_light[worse] = OWN_LIGHT
+    fit._take(worse)
+    fit._step(worse, learn=True)
 
 
 def _run_without_doubt(fit, scenes):
