@@ -61,7 +61,7 @@ def gather_inputs(job, group) -> GroupInputs:
     of_file: dict[str, dict] = {}
     for number, name in group.last_fits:
         of_file.setdefault(name, {})[number] = job.plan.patches[number].box[:2]
-    before = {}
+    before: dict[int, tuple[dict, dict]] = {}
     for name, corners in of_file.items():
         before |= GroupResultsFile(job.folder / f"{name}.fits").last_fits(corners)
     return GroupInputs(labels, None if group.round == 0 else _light(job, group), before)
