@@ -17,7 +17,8 @@ from .step_control import StepControl
 
 # Largest number of steps, and the gain in chi2 below which they end, measured or expected.
 N_STEPS, CHI2_TOL = 40, 1.0
-# Largest number of steps after each large profile that is added, before all are fitted together.
+# Largest number of steps after each large profile that is added, before all are fitted together:
+# these end where they gain less than NEED, as smaller differences do not choose profiles.
 N_FIRST_STEPS = 5
 # A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
 # per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
