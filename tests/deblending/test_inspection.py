@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from clresample.deblending.blend import Blend
-from clresample.deblending.inspection import levels, listing, spoilt
+from clresample.deblending.inspection import levels, listing, shifted, spoilt
+from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import _level_lines, inspect
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
@@ -242,6 +243,20 @@ def test_observations_that_disagree_are_moved(shift):
     said = inspected(both, fit_shifts=False)
     assert said.settings.fit_shifts is False and not said.shifts.any()
     assert len(said.messages) == any(shift)
+
+
+@pytest.mark.parametrize("shift, n_channels", [((0.0, 0.0), 1), ((0.5, -0.4), 2)])
+def test_a_second_channel_confirms_the_shift_of_the_first(shift, n_channels, monkeypatch):
+    there = tuple(((y + shift[0], x + shift[1]), f, s) for (y, x), f, s in DRAWN)
+    images, compared = [looked_at(observed(image_of(d))) for d in (DRAWN, there)], []
+
+    def noted(one, other, places):
+        compared.append(other)
+        return shifts_at(one, other, places)
+
+    monkeypatch.setattr(shifted, "shifts_at", noted)
+    found, error = shifted._closer(*images)
+    assert len(compared) == n_channels and shifted.significant(found, error) == any(shift)
 
 
 def test_coarse_psfs_are_named():

@@ -78,6 +78,14 @@ def valley(monkeypatch):
     return made
 
 
+def test_steps_end_where_the_next_one_gains_less_than_asked(valley):
+    fit, looking = valley([0.5, 0.05])
+    before = looking.n_looks.copy()
+    fit._step(np.arange(2), tol=30.0)
+    assert (looking.n_looks - before).tolist() == [1, 0]  # chi2 of 21 and of 25 is left
+    assert 101 < fit.chi2[0] < 130 and fit.chi2[1] == pytest.approx(125)
+
+
 def test_profiles_step_to_the_bottom_and_stop_there(valley):
     """Each at its own pace, 1 at most at a time, until a step gains chi2 of 1."""
     fit, looking = valley([0.5, 2.4, 0.0])

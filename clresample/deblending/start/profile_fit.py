@@ -21,7 +21,8 @@ N_STEPS, CHI2_TOL = 40, 1.0
 # were too long, and shorter ones follow, 8 trials more in 206 of 24 scenes (bench.throughput). A
 # pair ended 18 in chi2 early, and moved by 0.3 sigma with a faint source far away.
 MAX_SHORTFALL = 2.0
-# Largest number of steps after each large profile that is added, before all are fitted together.
+# Largest number of steps after each large profile that is added, before all are fitted together:
+# these end where they gain less than NEED, as smaller differences do not choose profiles.
 N_FIRST_STEPS = 5
 # A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
 # per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
