@@ -110,14 +110,14 @@ def _core(light, usable, masked, psf, band, fwhm):
 
     None if the light beside the group is not that of a star.
     """
-    for guess in _guesses(light, usable, masked):
-        centred = _ring_about(light, usable, masked, guess, fwhm)
-        if centred is not None:
-            place, ring, inner, scatter = centred
-            if scatter > MAX_SCATTER or not _falls_like(light, ring, place, psf, band, fwhm):
-                return None
-            return StarCore(place, inner, float(np.median(light[ring])), masked)
-    return None
+    about = (_ring_about(light, usable, masked, at, fwhm) for at in _guesses(light, usable, masked))
+    centred = [one for one in about if one is not None]
+    if not centred:
+        return None
+    place, ring, inner, scatter = min(centred, key=lambda one: one[-1])
+    if scatter > MAX_SCATTER or not _falls_like(light, ring, place, psf, band, fwhm):
+        return None
+    return StarCore(place, inner, float(np.median(light[ring])), masked)
 
 
 def _guesses(light, usable, masked):

@@ -200,8 +200,7 @@ class ProfileFit:
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
         prior = (a[scenes] for a in (self.source, self.population.stars, self.population.own_light))
-        factors = contamination_factors(normal, spectra, *prior)
-        self.population.set_contamination(scenes, factors)
+        self.population.set_contamination(scenes, contamination_factors(normal, spectra, *prior))
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some of the scenes rendered last."""
