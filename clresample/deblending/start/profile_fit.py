@@ -176,12 +176,10 @@ class ProfileFit:
                 break
             gain = self._try(scenes, trial[on])
             gained = gain > 0
-            small = (gain < CHI2_TOL) & (promised[on] < MAX_SHORTFALL * CHI2_TOL)
-            live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & small)
+            live[scenes] = steps.take(scenes, gain, promised[on]) & ~_is_last(gain, promised[on])
             if gained.any():
                 self._take_equations(scenes[gained])
-            further = scenes[gained & live[scenes]]
-            some = further[learning[further]]
+            some = scenes[gained & live[scenes] & learning[scenes]]
             if len(some) and i_step < n_steps - 1:
                 learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
         if learn:
@@ -256,6 +254,11 @@ class ProfileFit:
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
+
+
+def _is_last(gain, promised):
+    """Selects steps (k,) with gains in chi2 too small for others; see MAX_SHORTFALL."""
+    return (gain > 0) & (gain < CHI2_TOL) & (promised < MAX_SHORTFALL * CHI2_TOL)
 
 
 def start_from(fit, known):
