@@ -40,9 +40,8 @@ def test_long_steps_of_coupled_parameters_keep_their_direction():
     trial, whole, taken = first_step(right, normal=normal)
     np.testing.assert_allclose(trial[:2], [MAX_STEP, -MAX_STEP / 2])
     assert 0 < taken < whole
-    assert taken == pytest.approx(
-        2 * trial[:2] @ right[:2] - trial[:2] @ normal[:2, :2] @ trial[:2]
-    )
+    step = trial - [0, 0, 0, 1.5]
+    assert taken == pytest.approx(2 * step @ right - step @ normal @ step)
 
 
 def test_held_components_do_not_move():

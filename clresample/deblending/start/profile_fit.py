@@ -149,12 +149,11 @@ class ProfileFit:
                 break
             gain = self._try(scenes, trial[on])
             gained = gain > 0
-            small = (gain < tol) & (promised[on] < MAX_SHORTFALL * tol)
-            live[scenes] = steps.take(scenes, gain, promised[on]) & ~(gained & small)
+            last = _is_last(gain, promised[on], tol)
+            live[scenes] = steps.take(scenes, gain, promised[on]) & ~last
             if gained.any():
                 self._take_equations(scenes[gained])
-            further = scenes[gained & live[scenes]]
-            some = further[learning[further]]
+            some = scenes[gained & live[scenes] & learning[scenes]]
             if len(some) and i_step < n_steps - 1:
                 learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
         if learn:
@@ -230,6 +229,11 @@ class ProfileFit:
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))
+
+
+def _is_last(gain, promised, tol):
+    """Selects steps (k,) with gains in chi2 too small for others; see MAX_SHORTFALL."""
+    return (gain > 0) & (gain < tol) & (promised < MAX_SHORTFALL * tol)
 
 
 def start_from(fit, known):
