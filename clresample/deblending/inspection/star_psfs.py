@@ -60,6 +60,11 @@ SAME_PLACE_PX = 0.5
 # [sigma] Largest light of the last ring of a profile: brighter rings that rise are those of
 # diffraction, which are the PSF's.
 MAX_END_SIGMAS = 30.0
+# [sigma] Smallest light of a halo at the edge of the PSF's image: fainter ones are not worth the
+# time that a PSF of its own takes in each window of a start.
+MIN_HALO_SIGMAS = 1.0
+# [1] Largest ratio of a halo to the PSF at the edge of its image: more light is of galaxies.
+MAX_HALO_RATIO = 2.0
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
 MIN_USABLE_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 
@@ -223,6 +228,8 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     beside = image.usable[c] & (away >= radius)
     profile = RadialProfile.measure(data, beside, away, image.sigma[c]) if is_wide else None
     keeps_core = profile is None or profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    if keeps_core and psf.spacing < 1:
+        return None  # each window of a start would transform all samples of a halo
     if keeps_core:
         middle, radius = place, inscribed_radius(psf, c)
         away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
@@ -248,6 +255,11 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     # samples at the PSF's spacing about the star, over all of the image that its halo reaches
     step, low, high = psf.spacing, -middle, np.array([n_y - 1, n_x - 1]) - middle
     if keeps_core:
+        at_edge = _scale(psf, c, profile, radius)
+        if profile.at(radius) < MIN_HALO_SIGMAS * image.sigma[c] or (
+            not at_edge or at_edge > MAX_HALO_RATIO * scale
+        ):
+            return None
         lit = np.flatnonzero(light > LIGHT_SIGMAS).max(initial=0)
         reach = max(float(lit), radius + fwhm)
         low, high = np.maximum(low, -reach), np.minimum(high, reach)
