@@ -12,6 +12,7 @@ from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.errors import Errors
 from clresample.deblending.posterior.shared_light import (
     MAX_DOUBT,
+    RING_STEP,
     DoubtedShape,
     exchanged_light,
     flux_changes,
@@ -33,12 +34,16 @@ def test_a_doubted_shape_has_less_of_the_datas_precision():
         assert shape.size_scatter == pytest.approx(SIZE_SCATTER * np.sqrt(wanted[0, 0]))
 
 
-def test_structure_at_another_place_is_counted_there():
-    """A bump of the neighbour's profile on a galaxy far wider is all the light that may be it."""
+@pytest.mark.parametrize("scale", [1.0, 0.7])
+def test_structure_at_another_place_is_counted_there(scale):
+    """A bump of the neighbour's profile on a galaxy far wider is all the light that may be it.
+
+    scale: of the wide galaxy's light in the outer rings of its profile, relative to that
+    """
     small = gaussian((9, 9), (4, 4), 2 * np.eye(2))
     wide = gaussian((41, 41), (20, 20), 200 * np.eye(2))
     small, wide = small / small.max(), wide / wide.max()
-    bumped = wide.copy()
+    bumped = np.where(wide < np.exp(-0.999 * RING_STEP), scale, 1) * wide
     bumped[3:12, 5:14] += 0.1 * small
     spectra = np.array([[2.0, 3.0], [50.0, 70.0]])
     parts = ((0, 0), bumped, spectra[1]), ((3, 5), small, spectra[0])
