@@ -104,8 +104,30 @@ def test_pieces_beside_a_large_one_wait_for_its_last_fit(
 ):
     """Piece 1 is beside 0 and 2; the last of `moves` repeats. Rough fits are not compared with."""
     siblings = ((1,), (0, 2), (1,))
-    patches = [SimpleNamespace(siblings=own, pieces=3, parent=70) for own in siblings]
-    plan = SimpleNamespace(patches=patches, groups=((0, 1, 2),), cut_groups=((0,), (1, 2)))
+    plan = plan_of(siblings, (70, 70, 70), ((0,), (1, 2)))
+    assert rounds_of(monkeypatch, tmp_path, plan, large, moves) == (fitted, unsettled)
+
+
+def test_pieces_that_have_not_settled_are_named_though_others_go_on(monkeypatch, tmp_path):
+    """0 and 1 move to their last round; 3 and 4 waited for 2, and settle a round later."""
+    siblings, parents = ((1,), (0,), (3, 4), (2, 4), (2, 3)), (70, 70, 80, 80, 80)
+    plan, moves = plan_of(siblings, parents, ((0, 1), (2, 3, 4))), [set(range(5))] * 4 + [set()]
+    fitted, unsettled = rounds_of(monkeypatch, tmp_path, plan, {2}, moves)
+    assert fitted[-2:] == [{0, 1, 3, 4}, {3, 4}] and unsettled == {70}
+
+
+def plan_of(siblings, parents, cut_groups):
+    """A plan of one group of patches, which are all cut."""
+    patches = [
+        SimpleNamespace(siblings=own, pieces=3, parent=parent)
+        for own, parent in zip(siblings, parents, strict=True)
+    ]
+    groups = (tuple(range(len(patches))),)
+    return SimpleNamespace(patches=patches, groups=groups, cut_groups=cut_groups)
+
+
+def rounds_of(monkeypatch, tmp_path, plan, large, moves):
+    """The pieces fitted again in each round, and the parents that have not settled."""
     done, left = [], list(moves)
 
     def moved(self, pieces):
@@ -121,8 +143,8 @@ def test_pieces_beside_a_large_one_wait_for_its_last_fit(
     monkeypatch.setattr(GroupResultsFile, "read", lambda *_: [dict.fromkeys(FOUND_COLUMNS, EMPTY)])
     job = SimpleNamespace(plan=plan, folder=tmp_path)
     progress = SimpleNamespace(stage=lambda *_: None)
-    _, found = rounds.fit_all_groups(job, None, progress)
-    assert done[1:] == fitted and found == unsettled
+    _, unsettled = rounds.fit_all_groups(job, None, progress)
+    return done[1:], unsettled
 
 
 def test_a_large_piece_has_many_pixels_times_sources():

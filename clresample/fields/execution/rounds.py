@@ -18,8 +18,8 @@ from .search_setup import read_search_setup
 from .tasks import TaskKind
 from .time_left import TimeLeft, remember_pace, remembered_pace
 
-# Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
-# light subtracted. Crowded pieces settle in the third or fourth round.
+# Largest number of times that a cut blend's piece is fitted again, with its neighbours' light
+# subtracted. Crowded pieces settle in the third or fourth round.
 ROUNDS = 4
 # The same for large pieces, which take tens of seconds each (fitting.LARGE). The first round
 # subtracts their neighbours' light; the changes in later rounds are smaller than the assumed error
@@ -61,7 +61,7 @@ def fit_all_groups(job, engine, progress):
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
     for n_round in itertools.count(1):
-        again = _without_waiting(job, {n for n in pending if history.may_change(n)})
+        again = _without_waiting(job, {n for n in pending if history.may_refit(n)})
         groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
@@ -79,12 +79,17 @@ def fit_all_groups(job, engine, progress):
         ]
         names = _fit_round(job, tasks, engine, progress)
         history.add(names)
-        moved = history.moved(again)
+        moved_now = history.moved(again)
+        moved = moved - again | moved_now
         pending -= again  # the others wait
-        pending |= {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
+        pending |= {n for n in pieces if moved_now.intersection(job.plan.patches[n].siblings)}
         parts += names
     # a piece's second fit follows a rough one, with which its fluxes cannot be compared
-    unsettled = {job.plan.patches[n].parent for n in moved if len(history.names[n]) > 2}
+    unsettled = {
+        job.plan.patches[n].parent
+        for n in moved
+        if len(history.names[n]) > 2 and pending.intersection(job.plan.patches[n].siblings)
+    }
     # sorted by name, so that sums of models do not depend on the order in which the groups ended
     return [_file(job, name) for name in sorted(parts)], unsettled
 
@@ -125,7 +130,7 @@ class _PieceHistory:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
 
-    def may_change(self, patch):
+    def may_refit(self, patch):
         """Returns True if a piece may be fitted again."""
         most = LARGE_ROUNDS if _is_large(self.job, patch) else ROUNDS
         return len(self.names[patch]) <= most
