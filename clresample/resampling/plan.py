@@ -99,7 +99,7 @@ class ResamplingPlan:
 
     @property
     def layout(self) -> tuple:
-        """Properties that plans share to be used side by side, images of equal sizes apart."""
+        """Properties, beside sizes of images, that plans in one batch have in common."""
         by_row = None if self.lines is None else self.lines.by_row
         return self.geometry, self.axes, self.n_terms, by_row
 

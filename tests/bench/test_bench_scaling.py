@@ -25,6 +25,16 @@ def test_the_tail_is_what_the_last_worker_did_alone():
     assert scaling.tail_of(turns, 2) == (9 - 3) + (12 - 10)
 
 
+def test_speed_ups_are_those_over_the_fewest_workers(monkeypatch):
+    monkeypatch.setattr(scaling, "written", lambda *_: (None, None))
+    monkeypatch.setattr(
+        scaling, "row_of", lambda toml, out, size, n, own: {"wall_s": 8 / n, "fit_s": 6 / n**2}
+    )
+    options = SimpleNamespace(quick=True, giant=False, repeats=1, workers=(4, 2))
+    rows = list(scaling.rows_of(160, options, ()))
+    assert [(row["speed_up"], row["fit_speed"]) for row in rows] == [(1, 1), (2, 4)]
+
+
 def test_a_halo_has_one_surface_brightness_in_all_instruments():
     from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 

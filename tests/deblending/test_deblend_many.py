@@ -59,9 +59,9 @@ def fit(b, device, settings=SETTINGS, **given):
     [
         ({}, np.float32),
         ({}, np.float64),
-        ({"fit_sky": True}, np.float64),
+        ({"fit_sky": True}, np.float32),
         ({"fit_shifts": True}, np.float64),
-        ({"prior": None}, np.float64),
+        ({"prior": None}, np.float32),
     ],
 )
 def test_each_is_as_if_alone(device, given, dtype):

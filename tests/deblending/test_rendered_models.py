@@ -7,7 +7,7 @@ import pytest
 from helpers.scenes import BRIGHT, SHAPE, frame, observe
 from helpers.start import least_squares, rendered, view, views
 
-from clresample.deblending.linear import rendered_models as room
+from clresample.deblending.linear import rendered_models
 from clresample.deblending.linear.rendered_models import (
     MorphologyModel,
     render_models,
@@ -35,13 +35,13 @@ def whole(origin, image):
 
 
 @pytest.mark.parametrize("fit_sky", [False, True])
-@pytest.mark.parametrize("whole_px", [room.WHOLE_PX, 0])
+@pytest.mark.parametrize("whole_px", [rendered_models.WHOLE_PX, 0])
 def test_models_are_seen_side_by_side_each_with_its_own_spectra(
     device, fit_sky, whole_px, monkeypatch
 ):
     """Whole frames and boxes; the second observation was taken with another PSF than it is fitted
     with."""
-    monkeypatch.setattr(room, "WHOLE_PX", whole_px)
+    monkeypatch.setattr(rendered_models, "WHOLE_PX", whole_px)
     sky = (0.4, -0.3, 0.2) if fit_sky else (0, 0, 0)
     own = [views(device, observe(BRIGHT, seed=i, sky=sky)) for i in range(2)]
     if fit_sky:
@@ -187,7 +187,7 @@ def test_what_is_seen_is_listed_by_scene_and_component():
     vars(sight).update(seen=flat, n_bands=n_bands, my=9, mx=11, place=place, lit=lit)
     sight.device, slots = SimpleNamespace(get=lambda array: array), SimpleNamespace(scene=scene)
     looking = SimpleNamespace(n_scenes=3, sights=[sight, sight], at=at, slots=slots)
-    found = room._taken(looking)
+    found = rendered_models._taken(looking)
     for b, own in enumerate(([0, 1], [2, 3], [])):
         for shown in found[b]:
             assert shown.shape == (len(own), n_bands, *shape)

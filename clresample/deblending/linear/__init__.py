@@ -5,7 +5,7 @@ the device. linearised_scenes.py renders the components of all scenes in all obs
 for spectra; component_batch.py draws them in boxes, which render_planner.py and renderer.py render
 in windows placed by placing.py, as the solver's; slot_observation.py sums their products over the
 pixels of one observation; equations.py makes normal equations of the parameters from these sums;
-rendered_models.py does it for given morphologies.
+rendered_models.py renders fixed morphologies and solves for their spectra.
 Errors and joint steps use up to hundreds of modes of each component of one scene, on the host.
 mode_images.py has their images, aligned_observation.py renders them, normal.py sums their products
 in one matrix, and block_matrix.py factorises it. spectra.py solves for spectra, ties.py makes those
