@@ -227,7 +227,9 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
     beside = image.usable[c] & (away >= radius)
     profile = RadialProfile.measure(data, beside, away, image.sigma[c]) if is_wide else None
-    keeps_core = profile is None or profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    keeps_core = profile is None or (
+        profile.rises and profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    )
     if keeps_core and psf.spacing < 1:
         return None  # each window of a start would transform all samples of a halo
     if keeps_core:
@@ -247,9 +249,9 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         scale = _amplitude(psf, c, data, image.usable[c] & free & (away < radius), middle)
     else:
         scale = _scale(psf, c, profile, radius)
-    if not scale:
-        return None
     rays, seen, free = _rays(data - profile.at(away), image.usable[c], free, middle, radius)
+    if not scale or not (seen & free).any():
+        return None
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, seen & free, seen & ~free, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image that its halo reaches
@@ -272,6 +274,8 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
     more = _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
+    if keeps_core:
+        more *= 1 - taken
     whole = taken * scale * _within_image(psf, c, y, x) + (1 - taken) * profile.at(away) + more
     total = whole.sum()
     if not total > 0:
