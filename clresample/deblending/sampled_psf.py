@@ -29,8 +29,7 @@ def sampled_psfs(frame, observations, position) -> tuple:
     """PSFs at a position (2,) [px of the frame] of all observations on whose pixels it lies.
 
     Only PSFs sampled more finely than the pixels have those waves. Stars with PSFs of their own
-    are left out, unless they keep the core of the PSF passed: these were measured on the pixels
-    themselves.
+    are left out: these were measured on the pixels themselves.
     """
     found = []
     pixels = np.asarray(position) + [[0, 0], [1, 0], [0, 1]]
@@ -43,8 +42,7 @@ def sampled_psfs(frame, observations, position) -> tuple:
             continue
         field, place = o.psf_field, np.clip(places[0], 0, np.array(o.data.shape[1:]) - 1)
         if isinstance(field, StarPSFs):
-            star = field.number_at(*place)
-            if star is None or field.keeps_core[star]:
+            if field.number_at(*place) is None:
                 found.append(field.passed_at(*place))
         else:
             found.append(o.psf if field is None else field.psf_at(*place))
