@@ -40,10 +40,7 @@ from .star_profile import RadialProfile
 # Unlisted sources are narrower than half of it, or fainter than such light.
 MEDIANS_FWHM = {-np.inf: 8.0, 30.0: 3.0, 100.0: 1.0}
 # [sigma], [distance from the star] Light of a listed source ends where the median of a ring around
-# it is fainter, or at this part of the distance. Galaxies of sigma 3.5 px, 16 px from a star, have
-# 0.69 to 0.99 of their flux, those five times as bright 0.92 to 0.95; with 0.5 and 0.5, and the
-# star's mean profile measured on them too, they had 0.49 to 0.64 and 0.70 to 0.72
-# (tests/measurement/test_saturated_stars.py, seeds 3 to 7).
+# it is fainter, or at this part of the distance: beyond both it is taken for the star's.
 LIGHT_SIGMAS, REACH_PART = 0.25, 0.75
 # Iterations in which the smoothed remainder is added, so that gradients are preserved.
 N_ROUNDS = 5
