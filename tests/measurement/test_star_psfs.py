@@ -1,8 +1,11 @@
 """PSFs of single stars with a masked core, from images of one star."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from clresample.deblending.assessment.cores import _neighbour_errors
 from clresample.deblending.blend import Blend
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import inspect
@@ -102,3 +105,30 @@ def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
     assert found.blend.observations[0].psf_field is None
     assert np.isinf(found.levels[0].error).all()
     assert not [message for message in found.messages if "sky" in message]
+
+
+def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it():
+    """sum w m L / sum w m^2 flux, of a source of two components, and of one without flux."""
+    rng, psf_error = np.random.default_rng(2), 0.03
+    rendered, spectra = rng.random((4, 2, 5, 6)), np.array([[9e3, 4e3], [3, 2], [1, 5], [0, 0]])
+    weights, used = rng.uniform(0.5, 2, (2, 5, 6)), rng.random((2, 5, 6)) < 0.8
+    owner, sums = np.array([0, 1, 1, 2]), np.array([1.0, 3.0, 2.0, 4.0])
+    parts = zip(owner, spectra, sums, strict=True)
+    result = SimpleNamespace(
+        components=[SimpleNamespace(spectrum=s, morphology=np.array(m)) for _, s, m in parts],
+        rendered=[rendered],
+        channel_slices=lambda: [slice(0, 2)],
+        footprints=[SimpleNamespace(used=used)],
+        observations=[SimpleNamespace(weights=weights)],
+        sources=range(3),
+    )
+    found = _neighbour_errors(result, 0, 0, owner, psf_error)
+    light = spectra[0][:, None, None] * rendered[0]
+    w = used / (1 / weights + (psf_error * light) ** 2)
+    several = spectra[1][:, None, None] * rendered[1] + spectra[2][:, None, None] * rendered[2]
+    models = (several, 3 * spectra[1] + 2 * spectra[2]), (rendered[3], 4.0)
+    wanted = [
+        (w * model * light).sum((1, 2)) / (w * model**2).sum((1, 2)) * flux
+        for model, flux in models
+    ]
+    np.testing.assert_allclose(found, [[0, 0], *wanted])
