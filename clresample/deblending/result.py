@@ -253,7 +253,7 @@ class Result(ResultDisplay):
         They also scatter by what is open of the division of light between neighbours
         (posterior/shared_light.py) and of size and wings of faint galaxies (start/shape_grid.py),
         which can make fluxes negative. Errors of the catalogue are larger where they include light
-        outside the images, or a saturated core.
+        outside the images, a saturated core, or the light of a saturated star beside them.
 
         rng: NumPy Generator, or a seed
 

@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from clresample.deblending.batch import deblend
 from clresample.deblending.inspection.star_psfs import StarPSFs
-from clresample.deblending.profiles import ALIAS_PX, StarProfile, draw_psf
+from clresample.deblending.profiles import ALIAS_PX, GalaxyProfile, StarProfile, draw_psf
 from clresample.deblending.sampled_psf import MAX_REACH_PX, reach_px, sampled_psfs
+from clresample.deblending.start.population import is_exact
 from clresample.resampling.resampler import Resampler
 from clresample.sky.frame import Frame, model_psf
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation, with_psf_field
 from clresample.sky.psf import PSF
+from clresample.sky.sources import ExtendedSource, PointSource
 
 SHAPE, SIGMA = (41, 45), 0.45  # of the light before the pixel [px]
 GRID = Grid.flat(SHAPE, 0.1)
@@ -25,7 +28,7 @@ def pixel_psf():
     return PSF(np.outer(edges[0] - edges[1], edges[0] - edges[1]), spacing=0.25)
 
 
-def exact(place):
+def exact_light(place):
     """Light in the pixels of a star of unit flux at a place (2,) [px]."""
     sides = []
     for n, c in zip(SHAPE, place, strict=True):
@@ -43,7 +46,7 @@ def observation(psf=None, grid=GRID):
 def test_stars_are_exact_on_the_pixels_that_alias_their_light(device, place):
     psf, model = pixel_psf(), model_psf(0.8)
     op = Resampler(GRID, model, GRID, psf, device=device, dtype=np.float64)
-    wanted = exact(place)
+    wanted = exact_light(place)
     own, smooth = (
         op(draw_psf(model, place, SHAPE, slopes=False, sampled=sampled)) - wanted
         for sampled in ((psf,), ())
@@ -84,6 +87,7 @@ def test_boxes_hold_the_waves_of_bright_stars():
         (None, GRID, 1),
         (None, GRID.cutout(-3, 5, (50, 51)), 1),
         (PSF.gaussian(1.0), GRID, 0),  # no sample between pixels
+        (PSF.gaussian(2.0, n_pixels=81, spacing=0.25), GRID, 0),  # no wave below two pixels
         (None, Grid.flat(SHAPE, 0.1, center_arcsec=(0.03, 0)), 0),  # between the frame's pixels
         (None, Grid.flat(SHAPE, 0.2), 0),
     ],
@@ -93,11 +97,44 @@ def test_psfs_are_of_observations_on_the_frames_pixels(psf, grid, n):
     assert len(found) == n
 
 
-@pytest.mark.parametrize("keeps_core", [False, True])
-def test_stars_with_psfs_of_their_own_are_left_out_unless_they_keep_the_core(keeps_core):
+def test_stars_with_psfs_of_their_own_are_left_out():
     psf, place = pixel_psf(), np.array([20.3, 22.4])
-    own, kept = PSF.gaussian(2.0), np.array([keeps_core])
-    field = StarPSFs(psf, None, place[None], (own,), np.zeros((1, 1)), kept)
+    field = StarPSFs(
+        psf, None, place[None], (PSF.gaussian(2.0),), np.zeros((1, 1)), np.zeros(1, bool)
+    )
     home, one = Frame(GRID, model_psf(0.8)), with_psf_field(observation(), field)
-    assert sampled_psfs(home, [one], place) == ((psf,) if keeps_core else ())
+    assert sampled_psfs(home, [one], place) == ()
     assert sampled_psfs(home, [one], place + 5) == (psf,)
+
+
+def test_a_galaxy_beside_a_star_has_its_flux_however_finely_the_psf_is_sampled():
+    """Without waves that pixels alias the star's model is exact for its neighbours."""
+    star, at, fwhm_px, shape = np.array([24.3, 27.6]), np.array([18.3, 29.6]), 4.0, (49, 53)
+    y, x = np.indices(shape)
+
+    def moffat(y, x):
+        radius = fwhm_px / 2 / np.sqrt(2**0.4 - 1)
+        return (1 + (y**2 + x**2) / radius**2) ** -2.5 * 1.5 / (np.pi * radius**2)
+
+    sigma2 = 3.0**2 + (fwhm_px / 2.355) ** 2
+    flux = 20 * 5 * np.sqrt(4 * np.pi * sigma2)
+    light = np.exp(-((y - at[0]) ** 2 + (x - at[1]) ** 2) / (2 * sigma2)) / (2 * np.pi * sigma2)
+    data = 3e4 * moffat(y - star[0], x - star[1]) + flux * light
+    data += np.random.default_rng(1).normal(0, 5, shape)
+    found = []
+    for spacing in (1.0, 0.5):
+        sides = np.arange(-20, 20 + spacing / 2, spacing)
+        psf = PSF(moffat(sides[:, None], sides), spacing=spacing)
+        one = Observation(data, psf, Grid.flat(shape, 0.26), weights=1 / 25, channels=("r",))
+        result = deblend([one], [PointSource(position_px=star), ExtendedSource(position_px=at)])
+        found.append((result.components[1].flux[0], result.errors.flux[0, 1, 1] ** 0.5))
+    for galaxy, error in found:
+        assert abs(galaxy - flux) < max(2 * error, 0.1 * flux)
+    assert abs(found[0][0] - found[1][0]) < 0.5 * found[0][1]
+
+
+@pytest.mark.parametrize("sampled, exact", [((), True), ((pixel_psf(),), False)])
+def test_stars_are_exact_for_their_neighbours_unless_pixels_alias_them(sampled, exact):
+    home = Frame(GRID, model_psf(0.8))
+    assert is_exact(StarProfile(home, free=True, sampled=sampled)) == exact
+    assert not is_exact(GalaxyProfile(home))

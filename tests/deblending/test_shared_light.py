@@ -147,6 +147,8 @@ def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypat
         ((14, 14), (300, 250, 280), 3.0),
         ((19, 14), (12, 9, 10), 1.2),
         ((14, 44), (12, 9, 10), 1.2),
+        ((16, 74), (300, 250, 280), 0),  # a star: its model is nearly exact
+        ((19, 74), (12, 9, 10), 1.2),
     )
     seen = []
 
@@ -155,10 +157,11 @@ def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypat
         return with_shared_light(errors, doubts, exchanged)
 
     monkeypatch.setattr(posterior, "with_shared_light", spied)
-    result = fit(blend(objects, shape=(30, 60), seed=5), device)
+    result = fit(blend(objects, shape=(30, 90), seed=5), device)
     flux = np.linalg.norm([c.flux for c in result.components], axis=1)
     doubt = np.linalg.norm(seen[0], axis=(1, 2))
     assert 0.2 * flux[1] < doubt[1] < 1.01 * MAX_DOUBT * flux[1]
     assert doubt[2] < 1e-3 * flux[2]
+    assert doubt[4] < 1e-3 * flux[4]
     variance = np.diagonal(result.errors.flux, axis1=1, axis2=2)
     assert (variance >= np.square(seen[0]).sum(axis=2).T).all()

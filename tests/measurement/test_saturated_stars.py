@@ -125,6 +125,16 @@ def test_a_core_wider_than_the_psfs_image_is_found():
     assert np.hypot(*(core.place - STAR)) < 0.2
 
 
+@pytest.mark.parametrize("half_px, n", [(6, 0), (12, 1)])
+def test_galaxies_with_masked_centres_are_no_cores_of_stars_with_a_small_psf_image(half_px, n):
+    """An exponential one; a star's core beyond a large image is one."""
+    away = np.hypot(*(np.indices((101, 101)) - np.array([50.2, 49.7])[:, None, None]))
+    sides = np.arange(-half_px, half_px + 1.0)
+    masked, psf = away < 4, PSF(moffat(sides[:, None], sides))
+    light = {6: 1e4 * np.exp(-away / 3), 12: 1e7 * moffat(away, 0.0)}[half_px]
+    assert len(star_cores(np.where(masked, 0, light), ~masked, psf, 0)) == n
+
+
 def test_light_behind_a_listed_source_is_that_of_the_opposite_side():
     spikes = np.zeros((40, 200))
     spikes[:, [40, 140]] = 9.0

@@ -88,10 +88,10 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image, wide, own = with_star_psfs(image, sources, there, settings.fit_sky)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
-        if own.any():
+        if wide.any():
             levels[-1] = replace(levels[-1], error=np.full_like(levels[-1].error, np.inf))
         about = _unsure_lines if settings.fit_sky else _level_lines
-        lines = _unmeasured(image) + ([] if own.any() else about(image, levels[-1]))
+        lines = _unmeasured(image) + ([] if wide.any() else about(image, levels[-1]))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)

@@ -33,6 +33,9 @@ MIN_RING_PIXELS, MIN_QUARTERS = 12, 3
 # Largest ratio of outer to inner light in the ring, in units of the PSF's ratio: PSFs are uncertain
 # in their wings. A galaxy has a larger ratio.
 MAX_FLATTER = 2.0
+# [FWHM] Smallest half side of a PSF image that has wings: exponential galaxies with masked centres
+# fall like the cores of smaller ones (tests/measurement/test_saturated_stars.py).
+MIN_WINGS_FWHM = 2.0
 # [e-foldings] Largest mean deviation of the ring's light from its value at each radius: stars have
 # that of spikes, of diffraction rings and of the PSF's ellipticity.
 MAX_SCATTER = 0.65
@@ -202,13 +205,15 @@ def _falls_like(light, ring, place, psf, band, fwhm):
     bright = np.array([np.median(light[ring][part]) for part in (~outer, outer)])
     if not (bright > 0).all():
         return False
-    # beyond the PSF's image, light is compared with that at the same ratio of radii within it
-    inside = radii * min(1.0, inscribed_radius(psf, band) / radii[1])
+    # beyond a large image of the PSF light is compared with that at the same ratio of radii in it
+    falls, reach = bool(bright[1] < bright[0]), inscribed_radius(psf, band)
+    is_large = reach >= MIN_WINGS_FWHM * fwhm
+    inside = radii * min(1.0, reach / radii[1]) if is_large else radii
     angles = np.arange(16) * np.pi / 8
     own = [
         np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
         for r in inside
     ]
-    if not min(own) > 0:
-        return bool(bright[1] < bright[0])
-    return bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])
+    if not min(own) > 0 or not (is_large or own[0] > own[1]):
+        return falls
+    return (is_large or falls) and bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])

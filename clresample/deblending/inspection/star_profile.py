@@ -21,10 +21,12 @@ class RadialProfile:
 
     log_radius, log_light (n,): of its rings, n > 2. Light is interpolated between them and
     continued by a power of the distance beyond both ends.
+    rises: True if the next ring beyond them is brighter than the last
     """
 
     log_radius: np.ndarray
     log_light: np.ndarray
+    rises: bool = False
 
     @classmethod
     def measure(cls, data, usable, away, sigma):
@@ -32,17 +34,18 @@ class RadialProfile:
 
         Rings end where their light rises or is below RING_SIGMAS. None if fewer than three remain.
         """
-        rings, found = np.rint(away[usable]).astype(int), []
+        rings, found, rises = np.rint(away[usable]).astype(int), [], False
         value, radius = data[usable], away[usable]
         for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):
             own = rings == r
             if own.sum() < MIN_RING:
                 continue
             light = np.median(value[own])
-            if light < RING_SIGMAS * sigma or (found and light > found[-1][1]):
+            rises = bool(found) and light > found[-1][1]
+            if rises or light < RING_SIGMAS * sigma:
                 break
             found.append((np.median(radius[own]), light))
-        return cls(*np.log(found).T) if len(found) > 2 else None
+        return cls(*np.log(found).T, rises) if len(found) > 2 else None
 
     def at(self, radius):
         """Light at distances [px], of any shape; distances below one pixel count as one."""

@@ -40,10 +40,7 @@ from .star_profile import RadialProfile
 # Unlisted sources are narrower than half of it, or fainter than such light.
 MEDIANS_FWHM = {-np.inf: 8.0, 30.0: 3.0, 100.0: 1.0}
 # [sigma], [distance from the star] Light of a listed source ends where the median of a ring around
-# it is fainter, or at this part of the distance. Galaxies of sigma 3.5 px, 16 px from a star, have
-# 0.69 to 0.99 of their flux, those five times as bright 0.92 to 0.95; with 0.5 and 0.5, and the
-# star's mean profile measured on them too, they had 0.49 to 0.64 and 0.70 to 0.72
-# (tests/measurement/test_saturated_stars.py, seeds 3 to 7).
+# it is fainter, or at this part of the distance: beyond both it is taken for the star's.
 LIGHT_SIGMAS, REACH_PART = 0.25, 0.75
 # Iterations in which the smoothed remainder is added, so that gradients are preserved.
 N_ROUNDS = 5
@@ -107,10 +104,10 @@ class StarPSFs(PSFField):
 def with_star_psfs(image, sources, places, sky):
     """The InspectedImage with own PSFs for masked stars, and two numbers of channels (S,) of each.
 
-    Those in which it has a wide core, and those of them in which it does not keep the PSF's core.
+    Those in which it has a wide core, from MIN_STAR_RADIUS_FWHM, and those of them in which it does
+    not keep the PSF's core. A source listed as a galaxy with a wide core is a star in all channels.
 
-    The masked pixels of all cores grow by WIDE_GROW_PX, or `spoilt.GROW_PX` for stars with cores
-    below MIN_STAR_RADIUS_FWHM, which keep the PSF passed within its image and do not count; see
+    The masked pixels of wide cores grow by WIDE_GROW_PX, of others by `spoilt.GROW_PX`; see
     `StarCore.grown`. Without any core the image is returned unchanged.
 
     sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
@@ -120,33 +117,31 @@ def with_star_psfs(image, sources, places, sky):
     found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
     if not stars or image.usable.all():
         return image, n_wide, n_own
-    wide = np.zeros(image.usable.shape, bool)
-    for c in range(len(wide)):
-        for core in star_cores(image.significance[c], image.usable[c], image.observation.psf, c):
+    for c, usable in enumerate(image.usable):
+        for core in star_cores(image.significance[c], usable, image.observation.psf, c):
             away = np.hypot(*(image.places[stars] - core.place).T)
-            i = stars[int(away.argmin())]
-            is_wide = core.radius > MIN_STAR_RADIUS_FWHM * image.observation.psf.fwhm_px[c]
-            if away.min() < max(core.radius, 1.0) and (
-                is_wide or isinstance(sources[i], PointSource)
-            ):
-                grow = WIDE_GROW_PX if is_wide else GROW_PX
-                wide[c] |= image.usable[c] & core.grown(
-                    image.significance[c], image.usable[c], grow
-                )
-                found.setdefault(i, {})[c] = core, is_wide
-    image = image.without(wide) if wide.any() else image
+            if away.min() < max(core.radius, 1.0):
+                is_wide = core.radius > MIN_STAR_RADIUS_FWHM * image.observation.psf.fwhm_px[c]
+                found.setdefault(stars[int(away.argmin())], {}).setdefault(c, (core, is_wide))
     for i, cores in list(found.items()):
+        n_wide[i] = sum(is_wide for _, is_wide in cores.values())
+        if not n_wide[i] and not isinstance(sources[i], PointSource):
+            del found[i]
+    grown = np.zeros(image.usable.shape, bool)
+    for c, (core, is_wide) in (pair for cores in found.values() for pair in cores.items()):
+        given = image.significance[c], image.usable[c], WIDE_GROW_PX if is_wide else GROW_PX
+        grown[c] |= image.usable[c] & core.grown(*given)
+    image = image.without(grown) if grown.any() else image
+    for i, cores in found.items():
         own = {c: _measure_psf(image, c, i, *core, sky) for c, core in cores.items()}
-        own = {c: measured for c, measured in own.items() if measured is not None}
-        n_wide[i] = sum(cores[c][1] for c in own)
-        n_own[i] = sum(not measured.keeps_core for measured in own.values())
-        found[i] = own
+        found[i] = {c: measured for c, measured in own.items() if measured is not None}
+        n_own[i] = sum(not measured.keeps_core for measured in found[i].values())
     found = {i: own for i, own in found.items() if own}
     if not found:
         return image, n_wide, n_own
     o, numbers = image.observation, sorted(found)
     psfs = tuple(_combine_psfs(_listed_psf(o, places[i]), found[i]) for i in numbers)
-    flux_error = np.zeros((len(numbers), len(wide)))
+    flux_error = np.zeros((len(numbers), len(grown)))
     for k, i in enumerate(numbers):
         for c, measured in found[i].items():
             flux_error[k, c] = measured.flux_error
@@ -227,7 +222,9 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
     beside = image.usable[c] & (away >= radius)
     profile = RadialProfile.measure(data, beside, away, image.sigma[c]) if is_wide else None
-    keeps_core = profile is None or profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    keeps_core = profile is None or (
+        profile.rises and profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
+    )
     if keeps_core and psf.spacing < 1:
         return None  # each window of a start would transform all samples of a halo
     if keeps_core:
@@ -247,9 +244,9 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         scale = _amplitude(psf, c, data, image.usable[c] & free & (away < radius), middle)
     else:
         scale = _scale(psf, c, profile, radius)
-    if not scale:
-        return None
     rays, seen, free = _rays(data - profile.at(away), image.usable[c], free, middle, radius)
+    if not scale or not (seen & free).any():
+        return None
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, seen & free, seen & ~free, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image that its halo reaches
@@ -272,6 +269,8 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
     more = _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
+    if keeps_core:
+        more *= 1 - taken
     whole = taken * scale * _within_image(psf, c, y, x) + (1 - taken) * profile.at(away) + more
     total = whole.sum()
     if not total > 0:

@@ -65,10 +65,10 @@ TAILS = np.array([4.0, 1e6, 1e6, 4.0])
 # 4000 and 5000). With 0.5 the shapes of two overlapping bright galaxies, a merger in HSC's images,
 # stay wrong.
 NEIGHBOUR_MODEL_ERROR = 0.2
-# The same of a star, the default Settings.psf_error: its model is the PSF. With 0.2 a galaxy of
-# sigma 3 px and signal to noise 20 has 0.61 to 0.69 of its flux at 16 to 40 px from a saturated
-# star, five of its errors, and 0.80 to 0.97 within 1.1 errors with 0.03
-# (tests/measurement/test_saturated_stars.py).
+# The same of a star: its model is the PSF, uncertain by the default Settings.psf_error, which other
+# values of that leave as it is. With 0.2 a galaxy of sigma 3 px and signal to noise 20 has 0.61 to
+# 0.69 of its flux at 16 to 40 px from a saturated star, five of its errors, and 0.80 to 0.97 within
+# 1.1 errors with 0.03 (tests/measurement/test_saturated_stars.py).
 STAR_MODEL_ERROR = 0.03
 # Light of alike neighbours, as a part of a galaxy's own at its place, that leaves no doubt of its
 # shape, in scenes with large galaxies. With 0.5 one of 12 pairs of equals has half of its light in
