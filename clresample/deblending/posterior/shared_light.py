@@ -14,19 +14,20 @@ Structure of a source where another one has its light may be that one's. It is d
 profile fits, and is as uncertain as it is large: of component t at the place of profile p,
 
     e = A_t <p, S_t - P S_t> sum p / <p, p - P p>,
-    P v = p_t <v, p_t>_r / <p_t, p_t>_r   in each ring r between two isophotes of p_t
+    P v = p_t <v, p_t>_r / <p_t, p_t>_r   in each ring r between two isophotes of p_t,
 
-moves from one source to the other, all light of t at most: light of t's own may have another scale
-in each ring, so that only what p has off them can be p's. If the shape of p is doubted, p is drawn
-larger by one scatter of its ln sigma under C': a profile that is too small fits its source's core,
-and structure of the neighbour holds the ring around it. Without these two parts 2 in 100 satellites
-of giant galaxies were over 5 % and 5 sigma off with no flag, and none of 32 with them; with p as it
-was fitted one of 96 has half of its flux and no flag (bench.ladder, seed 9191). With <p, p> alone
-as the divisor two in three fluxes of galaxies 0.4 to 0.8 r_e apart, at signal to noise 3000, are
-over 3 errors off, by up to 9; with the part of p off p_t it is one in forty (40 blends of
-cli/device_tools/workload.py). With P of one ring the light of a satellite hides in what the giant's
-profile lacks all round: 1.2 % of 972 fluxes of giants and satellites are over 3 errors off, by up
-to 7, one without a flag; with rings 0.8 %, by up to 4 (bench.ladder, seeds 1212, 7373, 9494).
+or that of one ring, all of the image, where that is more, moves from one source to the other, all
+light of t at most. Light of t's own may have another scale, in each ring or as a whole, so that
+only what p has off it can be p's. If the shape of p is doubted, p is drawn larger by one scatter of
+its ln sigma under C': a profile that is too small fits its source's core, and structure of the
+neighbour holds the ring around it. Without these two parts 2 in 100 satellites of giant galaxies
+were over 5 % and 5 sigma off with no flag, and none of 32 with them; with p as it was fitted one of
+96 has half of its flux and no flag (bench.ladder, seed 9191). With <p, p> alone as the divisor two
+in three fluxes of galaxies 0.4 to 0.8 r_e apart, at signal to noise 3000, are over 3 errors off, by
+up to 9; with the part of p off p_t it is one in forty (40 blends of cli/device_tools/workload.py).
+With P of one ring the light of a satellite hides in what the giant's profile lacks all round: 1.2 %
+of 972 fluxes of giants and satellites are over 3 errors off, by up to 7, one without a flag; with
+rings 0.8 %, by up to 4 (bench.ladder, seeds 1212, 7373, 9494).
 """
 
 from __future__ import annotations
@@ -142,12 +143,10 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
     components, n_sources = result.components, len(result.sources)
     scene, source = solution.scene, solution.source
     out = np.zeros((n_sources, n_sources, len(result.channels)))
-    isophotes = [_Isophotes.of(p) for p in scene.profile]
+    rings = [(_Isophotes(p, np.inf), _Isophotes(p, RING_STEP)) for p in scene.profile]
     structure = [
-        np.zeros(p.shape) if fixed else rings.without(c.morphology, p)
-        for c, p, fixed, rings in zip(
-            components, scene.profile, scene.fixed, isophotes, strict=True
-        )
+        [] if fixed else [some.without(c.morphology) for some in its]
+        for c, fixed, its in zip(components, scene.fixed, rings, strict=True)
     ]
     low, high = scene.origin, scene.origin + [p.shape for p in scene.profile]
     for i, p in enumerate(scene.profile):
@@ -155,43 +154,36 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
             p = _larger_profile(solution, i, shapes[i].size_scatter)
         meet = ((low < high[i]) & (high > low[i])).all(axis=1) & (source != source[i])
         for j in np.flatnonzero(meet & ~scene.fixed):
-            here, there = intersect_boxes(low[i], p.shape, low[j], structure[j].shape)
-            most = components[j].morphology.sum()
-            alike = isophotes[j].power_within(p[here], scene.profile[j], there)
-            off = max(np.square(p).sum() - alike, 1e-30)
-            part = np.clip(p.sum() * (p[here] * structure[j][there]).sum() / off, -most, most)
+            here, there = intersect_boxes(low[i], p.shape, low[j], scene.profile[j].shape)
+            most, found = components[j].morphology.sum(), []
+            for some, rest in zip(rings[j], structure[j], strict=True):
+                off = np.square(p).sum() - some.power_within(p[here], there)
+                found.append((p[here] * rest[there]).sum() / max(off, 1e-30))
+            part = np.clip(p.sum() * max(found, key=abs), -most, most)
             out[components[i].source, components[j].source] += part * components[j].spectrum
     return out
 
 
-@dataclass(frozen=True, eq=False)
 class _Isophotes:
-    """Rings between isophotes of a profile, and projections P on the profile in each.
+    """Rings of a width `step` in the logarithm of a profile (ny, nx), and projections P on it."""
 
-    ring (ny, nx): number of each pixel's ring; power (n,): sum of the squared profile in each
-    """
-
-    ring: np.ndarray
-    power: np.ndarray
-
-    @classmethod
-    def of(cls, profile):
-        """From a profile (ny, nx)."""
+    def __init__(self, profile, step):
+        self.profile = profile
         depth = np.log(profile.max() / np.maximum(profile, MIN_LEVEL * profile.max()))
-        ring = (depth / RING_STEP).astype(int)
-        return cls(ring, np.bincount(ring.ravel(), np.square(profile).ravel()))
+        self.ring = (depth / step).astype(int)
+        self.power = np.bincount(self.ring.ravel(), np.square(profile).ravel())
+        self.power = np.maximum(self.power, 1e-30)
 
-    def without(self, image, profile):
+    def without(self, image):
         """An image (ny, nx) less its projection."""
-        share = np.bincount(self.ring.ravel(), (image * profile).ravel(), len(self.power))
-        return image - profile * (share / np.maximum(self.power, 1e-30))[self.ring]
+        share = np.bincount(self.ring.ravel(), (image * self.profile).ravel())
+        return image - self.profile * (share / self.power)[self.ring]
 
-    def power_within(self, image, profile, there):
+    def power_within(self, image, there):
         """Squared norm of the projection of an image of the pixels `there` (2 slices)."""
-        share = np.bincount(
-            self.ring[there].ravel(), (image * profile[there]).ravel(), len(self.power)
-        )
-        return float((np.square(share) / np.maximum(self.power, 1e-30)).sum())
+        weights = (image * self.profile[there]).ravel()
+        share = np.bincount(self.ring[there].ravel(), weights, len(self.power))
+        return float((np.square(share) / self.power).sum())
 
 
 def _larger_profile(solution, i, growth):
