@@ -127,6 +127,19 @@ def test_errors_hold_the_scatter_beside_the_curvature(fitted):
     assert changes.by[0, 0] == pytest.approx(scatter, rel=1e-3)
 
 
+def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatter(fitted):
+    """At signal to noise 3; one is significant from 5."""
+    before = []
+
+    def looked(fit, scenes):
+        before.append(fit.theta.copy())
+        shape_grid.fit_faint_shapes(fit, scenes)
+
+    (fit,), _ = fitted(galaxy(2.5, 6.5, 3), looked=looked)
+    np.testing.assert_array_equal(fit.theta, before[0])
+    assert fit.flux_scatter[0, 0] > 1
+
+
 @pytest.fixture
 def grid():
     """Makes a ShapeGrid with these gains (size, wings), and a fit for it with usual galaxies."""

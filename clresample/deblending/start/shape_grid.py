@@ -14,7 +14,9 @@ If a profile is better than the fitted one, the scene is fitted again from it. T
 are the posterior of size and wings. The prior and the contamination are the population's
 (population.py); unusual galaxies have any size and wings. Errors of fluxes include the flux's
 scatter under this posterior (posterior.py), which is about its mean if most of its weight is of
-unusual galaxies: these get the mean size and wings.
+unusual galaxies: these get the mean size and wings. Galaxies without significant light stay as they
+are, with that scatter: without it 11 % of fluxes at signal to noise 5 are over 5 errors off, by up
+to 16, and 6 % with it, by up to 8 (30 single galaxies of bench.ladder, seed 7777).
 """
 
 from __future__ import annotations
@@ -62,8 +64,9 @@ def fit_faint_shapes(fit, scenes):
         changed = _fitted_again(fit, better)
         grids |= _grids(fit, [i for i in grids if fit.looking.scene[i] in changed])
     for i, grid in grids.items():
+        theta, fit.flux_scatter[i] = grid.posterior(fit)
         if grid.gain.max() >= NEED * grid.contamination(fit):
-            fit.theta[grid.scene, grid.index], fit.flux_scatter[i] = grid.posterior(fit)
+            fit.theta[grid.scene, grid.index] = theta
 
 
 @dataclass(frozen=True, eq=False)
