@@ -7,6 +7,7 @@ import pytest
 
 from clresample.deblending.assessment.cores import _neighbour_errors
 from clresample.deblending.blend import Blend
+from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import inspect
 from clresample.deblending.inspection.psf_samples import psf_at
@@ -110,13 +111,16 @@ def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
 def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it():
     """sum w m L / sum w m^2 flux, of a source of two components, and of one without flux."""
     rng, psf_error = np.random.default_rng(2), 0.03
-    rendered, spectra = rng.random((4, 2, 5, 6)), np.array([[9e3, 4e3], [3, 2], [1, 5], [0, 0]])
+    low, spectra = [(0, 0), (1, 0), (2, 3), (0, 2)], np.array([[9e3, 4e3], [3, 2], [1, 5], [0, 0]])
+    images = [rng.random((2, *size)) for size in ((5, 6), (3, 4), (2, 3), (5, 4))]
+    images = ComponentImages((4, 2, 5, 6), low, images)
+    rendered = np.asarray(images)
     weights, used = rng.uniform(0.5, 2, (2, 5, 6)), rng.random((2, 5, 6)) < 0.8
     owner, sums = np.array([0, 1, 1, 2]), np.array([1.0, 3.0, 2.0, 4.0])
     parts = zip(owner, spectra, sums, strict=True)
     result = SimpleNamespace(
         components=[SimpleNamespace(spectrum=s, morphology=np.array(m)) for _, s, m in parts],
-        rendered=[rendered],
+        rendered=[images],
         channel_slices=lambda: [slice(0, 2)],
         footprints=[SimpleNamespace(used=used)],
         observations=[SimpleNamespace(weights=weights)],

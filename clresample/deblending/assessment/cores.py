@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..component_images import image_within, window_of
 from ..inspection.star_psfs import StarPSFs
 
 
@@ -55,8 +56,12 @@ def _neighbour_errors(result, i, k, owner, psf_error):
         parts = np.flatnonzero(owner == s)
         spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
         spectra = np.where(spectra.any(axis=0), spectra, 1.0)
-        model = sum(a[:, None, None] * rendered[j] for a, j in zip(spectra, parts, strict=True))
-        right, power = ((weights * model * b).sum((1, 2)) for b in (light, model))
+        sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
+        window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
+        images = (image_within(rendered, j, window) for j in parts)
+        model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
+        weighted = weights[:, *window] * model
+        right, power = ((weighted * b).sum((1, 2)) for b in (light[:, *window], model))
         flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
         out[s] = np.divide(right * flux, power, out=np.zeros_like(right), where=power > 0)
     return out

@@ -288,14 +288,17 @@ def _run_from_large_galaxies(fit, scenes):
     some, same = large.any(axis=1), (large == grown).all(axis=1)
     same |= fit.is_known[scenes] & (large <= grown).all(axis=1)
     fit._restore(before, scenes[same | ~some])
-    fit.population.own_light[scenes[some]] = OWN_LIGHT
-    fit._take(scenes[some])
-    fit._step(scenes[some], learn=True)
+    _go_on_with_less_doubt(fit, scenes[some])
     worse = scenes[some & ~(_chi2_as_expected(fit, scenes) < chi2)]
     fit._restore(before, worse)
-    fit.population.own_light[worse] = OWN_LIGHT
-    fit._take(worse)
-    fit._step(worse, learn=True)
+    _go_on_with_less_doubt(fit, worse)
+
+
+def _go_on_with_less_doubt(fit, scenes):
+    """Steps of scenes (k,) of a ProfileFit from where they are, with OWN_LIGHT."""
+    fit.population.own_light[scenes] = OWN_LIGHT
+    fit._take(scenes)
+    fit._step(scenes, learn=True)
 
 
 def _run_without_doubt(fit, scenes):
