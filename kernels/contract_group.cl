@@ -55,17 +55,18 @@
 #define LEFT VEC(ROWS_AT_ONCE)
 #define OWNED(i, v) (i0 + (i) < m && column[v] < width)
 
-/* Lane by lane: taking an address would make a GPU keep all sums in memory. */
-#define STORE_LANES(sums, c, n_left) EACH_LANE(STORE, sums, c, n_left)
+/* Lane by lane: taking an address would make a GPU keep all sums in memory. OpenCL C has no macros
+ * of variable numbers of arguments, and NVIDIA's driver refuses them. */
 #define STORE(j, lane, sums, c, n_left) if (j < n_left) c[(size_t)j * step_c] = sums.lane;
-#define EACH_2(f, ...) f(0, s0, __VA_ARGS__) f(1, s1, __VA_ARGS__)
-#define EACH_4(f, ...) EACH_2(f, __VA_ARGS__) f(2, s2, __VA_ARGS__) f(3, s3, __VA_ARGS__)
-#define EACH_8(f, ...) \
-    EACH_4(f, __VA_ARGS__) f(4, s4, __VA_ARGS__) f(5, s5, __VA_ARGS__) \
-    f(6, s6, __VA_ARGS__) f(7, s7, __VA_ARGS__)
-#define EACH_PASTE(n) EACH_##n
-#define EACH_EXPAND(n) EACH_PASTE(n)
-#define EACH_LANE(f, ...) EACH_EXPAND(VW)(f, __VA_ARGS__)
+#define STORE_2(sums, c, n_left) STORE(0, s0, sums, c, n_left) STORE(1, s1, sums, c, n_left)
+#define STORE_4(sums, c, n_left) \
+    STORE_2(sums, c, n_left) STORE(2, s2, sums, c, n_left) STORE(3, s3, sums, c, n_left)
+#define STORE_8(sums, c, n_left) \
+    STORE_4(sums, c, n_left) STORE(4, s4, sums, c, n_left) STORE(5, s5, sums, c, n_left) \
+    STORE(6, s6, sums, c, n_left) STORE(7, s7, sums, c, n_left)
+#define STORE_PASTE(n) STORE_##n
+#define STORE_EXPAND(n) STORE_PASTE(n)
+#define STORE_LANES STORE_EXPAND(VW)
 
 /* Neighbouring work-items fetch neighbouring elements of A: along its rows, or down its columns
  * where it is read transposed. */

@@ -28,6 +28,11 @@ def stray_restricts(text):
     return re.sub(r"__kernel\b[^;{]*?\([^{]*?\)\s*\{", "", code(text)).count("restrict")
 
 
+def variadic_macros(text):
+    """Macros of variable numbers of arguments: OpenCL C has none, NVIDIA's driver refuses them."""
+    return re.findall(r"\.\.\.\s*\)|__VA_ARGS__", code(text))
+
+
 def without_default(text):
     """Macros that decide what is compiled, and have no value of their own."""
     asked = re.findall(r"^#\s*(?:if|elif|ifdef)\b(.*)$", code(text), re.MULTILINE)
@@ -48,6 +53,11 @@ def test_lines_fit_a_page(file):
 @every_file
 def test_restrict_is_on_kernels_own_arguments(file):
     assert not stray_restricts(FILES[file])
+
+
+@every_file
+def test_macros_have_fixed_numbers_of_arguments(file):
+    assert not variadic_macros(FILES[file])
 
 
 @every_file
@@ -110,5 +120,6 @@ def test_one_package_sets_arguments_and_reads_the_kind_of_device(words):
 def test_faults_are_seen():
     assert stray_restricts("static void f(__global int *restrict x) {}")
     assert not stray_restricts("__kernel void f(__global int *restrict x)\n{ g(x); }")
+    assert variadic_macros("#define EACH(f, ...) f(0, __VA_ARGS__)")
     assert without_default("#if FAST\n#endif") == {"FAST"}
     assert not without_default("#ifndef FAST /* quick */\n#define FAST 0\n#endif\n#if FAST\n#endif")
