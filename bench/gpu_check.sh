@@ -5,8 +5,9 @@
 #     bench/gpu_check.sh [REPORT.md]
 #
 # PYTHON is the interpreter that has clresample (default .venv/bin/python, as make makes it);
-# CLRESAMPLE_DEVICE and CLRESAMPLE_ICD choose the device, as always. A step that fails, or takes
-# longer than its limit, is named in the report, and the others go on; then the status is 1.
+# CLRESAMPLE_DEVICE and CLRESAMPLE_ICD choose the device, as always; a GPU that is there and is not
+# used is named first, with the reason. A step that fails, or takes longer than its limit, is named
+# in the report, and the others go on; then the status is 1.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}
@@ -41,10 +42,8 @@ except DeviceError as error:
     printf '# %s\n\n' "${name:-No device}"
     printf '%s, %s, commit %s.\n' "$(date -u +%Y-%m-%dT%H:%MZ)" "$(uname -sm)" \
         "$(git rev-parse --short HEAD 2>/dev/null || echo unknown)"
-    if [ -z "$name" ]; then
-        printf '\n**No device could be opened, nothing was measured.**\n\n'
-        sed 's/^/    /' "$part"
-    fi
+    [ -n "$name" ] || printf '\n**No device could be opened, nothing was measured.**\n'
+    [ ! -s "$part" ] || { echo && sed 's/^/    /' "$part"; }
 } >"$report" || exit 1
 if [ -z "$name" ]; then
     cat "$part" >&2

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ..device.discovery import driver_hints, format_size, list_devices
+import warnings
+
+from ..device.discovery import HIDDEN_GPU, driver_hints, format_size, list_devices
 from .options import add_device_option, print_note
 
 COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
@@ -30,6 +32,7 @@ def run(arguments):
     print(format_table(list_devices(arguments.device)))
     for hint in driver_hints():
         print_note(arguments, hint)
+    warnings.filterwarnings("ignore", HIDDEN_GPU)  # the hints have said it
     device = get_device(arguments.device)
     if arguments.bench:
         from .device_tools.bench import bench_lines

@@ -33,6 +33,7 @@ from .discovery import (
     is_simulated,
     kind_of,
     load_pyopencl,
+    warn_hidden_gpus,
 )
 from .errors import OUT_OF_MEMORY_STATUS, allocation_error, fork_error, status_of, to_device_error
 from .kernel_profiler import start_profiling
@@ -282,7 +283,8 @@ def get_device(choice=None) -> Device:
         PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU;
         simulators come last. CLRESAMPLE_ICD names a driver library to look for devices in.
     At its first use a device renders a small image, which is compared with NumPy's. If the test
-    fails and no device was named, the next device is used, with a DeviceWarning.
+    fails and no device was named, the next device is used, with a DeviceWarning. One is also issued
+    if a CPU is used beside a GPU whose driver lies where the OpenCL loader does not look.
     Raises DeviceError if there is no platform, if nothing matches the choice, or if the device
     that was chosen fails that test.
     """
@@ -295,6 +297,8 @@ def get_device(choice=None) -> Device:
         if fault is None:
             for message in faults:
                 warnings.warn(f"{message}; {candidate.name} is used", DeviceWarning, stacklevel=2)
+            if is_default_choice(choice) and kind_of(candidate) != "GPU":
+                warn_hidden_gpus()
             return _of_this_process(_open(candidate))
         faults.append(fault)
     raise DeviceError(

@@ -12,11 +12,12 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from .device_cache import system_caches
+from .device_cache import DeviceWarning, system_caches
 from .drivers import (
     address_space_warning,
     driver_advice,
     driver_fault,
+    is_registered,
     named_library,
     pocl_cache_fault,
     register_named_library,
@@ -31,6 +32,7 @@ DEVICE_KINDS = ("GPU", "CPU", "ACCELERATOR")
 # Parts of the names of simulators and of software drivers that run on the CPU. These devices come
 # last in the choice, whatever kind they report.
 SIMULATED = ("oclgrind", "simulator", "emulat", "llvmpipe", "softpipe", "swiftshader")
+HIDDEN_GPU = "no GPU is used"  # begins the warning of `warn_hidden_gpus`
 # Compiles only where double is a type of 8 bytes, whatever the driver claims.
 FP64_PROBE = """
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -188,6 +190,18 @@ def driver_hints():
         driver_advice(vendor, path, _addresses(found))
         for vendor, path in undetected_drivers(_served(found))
     ]
+
+
+@functools.cache  # once
+def warn_hidden_gpus():
+    """Warns of GPU drivers that the loader does not look for, since a CPU is used instead."""
+    found = find_devices()
+    if named_library() or os.environ.get("OCL_ICD_VENDORS"):  # the user's own choice of drivers
+        return
+    for vendor, path in undetected_drivers(_served(found)):
+        if not is_registered(path):
+            advice = driver_advice(vendor, path, _addresses(found))
+            warnings.warn(f"{HIDDEN_GPU}: {advice}", DeviceWarning, stacklevel=3)
 
 
 def _served(found):

@@ -171,6 +171,12 @@ def _remove_of_gone(entry, pid):
         return
 
 
+def is_registered(path):
+    """True of a driver library that the OpenCL loader, or the system's own, has in its list."""
+    listed = _known() | (_read(VENDORS) if conda_prefix() else {})
+    return path.name in {Path(library).name for library in listed.values()}
+
+
 def driver_advice(vendor, path, served):
     """Remedy for a GPU's driver library that provides no device, in words.
 
@@ -180,9 +186,11 @@ def driver_advice(vendor, path, served):
     if path.name in {Path(library).name for library in _known().values()}:
         fault = driver_fault(str(path), served) or "brings no GPU"
         return f"{driver}, {path}, {fault}: is the GPU given to this machine or container?"
-    conda = conda_prefix()
-    if conda and path.name in {Path(library).name for library in _read(VENDORS).values()}:
-        return f"{driver} is at {path}, which the loader of {conda} does not read: {CONDA_CURE}"
+    if is_registered(path):
+        return (
+            f"{driver} is at {path}, which the loader of {conda_prefix()} does not read: "
+            f"{CONDA_CURE}"
+        )
     return f"{driver} is at {path}, where the OpenCL loader does not look: {icd_export_line(path)}"
 
 

@@ -88,6 +88,19 @@ def test_the_command_gives_the_cure(tmp_path):
     assert f"AMD's OpenCL driver is at {tmp_path}/libamdocl64.so" in answer.stderr
 
 
+def test_a_cpu_is_not_used_silently_beside_a_hidden_gpu(tmp_path):
+    if os.environ.get("OCL_ICD_VENDORS"):
+        pytest.skip("the drivers were chosen")
+    (tmp_path / "libamdocl64.so").write_text("")
+    code = "from clresample import get_device; get_device(); get_device(); get_device(0)"
+    answer = run_python("-c", code, LD_LIBRARY_PATH=_after(tmp_path))
+    cure = f"where the OpenCL loader does not look: export CLRESAMPLE_ICD={tmp_path}/libamdocl64.so"
+    assert answer.stderr.count("no GPU is used: AMD's OpenCL driver is at") == 1
+    assert cure in answer.stderr
+    chosen = run_python("-c", code, LD_LIBRARY_PATH=_after(tmp_path), CLRESAMPLE_DEVICE="0")
+    assert not chosen.stderr
+
+
 def test_a_library_that_is_no_driver_is_named(tmp_path):
     library = tmp_path / NVIDIA
     library.write_text("no library")
