@@ -1,6 +1,6 @@
 """Cost of a source: many joint scenes at once, and single blends of many sources.
 
-    python -m bench.throughput [--quick] [--json FILE]
+    python -m bench.throughput [--quick] [--processes N] [--json FILE]
 
 A row is one batch of simulated Euclid + Rubin scenes, images to catalogues, or one large blend:
 
@@ -9,7 +9,7 @@ own        the same scenes, each with a WCS, a rotation of Rubin's pixels and PS
 blend      one field of many sources, 7 bands, Rubin turned by 12 degrees; in a process of its own
 
 core_s_per_source   processor time of all threads, over all sources
-wall_s              of the whole: set-up, fit, errors, result, catalogue
+wall_s              of the whole: set-up, fit, errors, result, catalogue; also start of processes
 galsim_ms           processor time of one GalSim quintic render of one band, EUCLID -> RUBIN at
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
@@ -60,13 +60,13 @@ COLUMNS = records.columns(
 )
 
 
-def timed(what, blends, clock):
+def timed(what, blends, clock, processes=1):
     """Row of blends fitted side by side, up to their catalogues."""
     base_gb = _peak_gb()
     clock.ticks(N_TICKS)
-    wall_s, core_s = time.perf_counter(), time.process_time()
+    wall_s, core_s = time.perf_counter(), _core_s()
     with host_stages() as host:
-        results = scenes.fit(blends)
+        results = scenes.fit(blends, device=[None] * processes if processes > 1 else None)
         for result in results:
             if result.status == "failed":
                 raise RuntimeError(result.reason)
@@ -74,7 +74,7 @@ def timed(what, blends, clock):
         with host.stage("catalogue"):
             n_sources = sum(len(catalogue(result)) for result in results)
         ended = time.perf_counter()
-    wall_s, core_s = ended - wall_s, time.process_time() - core_s
+    wall_s, core_s = ended - wall_s, _core_s() - core_s
     clock.ticks(N_TICKS)
     galsim_ms = clock.take_ms()
     stage = Counter()
@@ -102,6 +102,11 @@ def timed(what, blends, clock):
         },
         "status": results[0].status if len(results) == 1 else f"{converged} converged",
     }
+
+
+def _core_s():
+    """Processor time of this process and of those that it started and that have ended [s]."""
+    return time.process_time() + sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
 
 
 def _peak_gb():
@@ -173,7 +178,7 @@ def rows_of(options):
     seeds = range(options.seed, options.seed + options.scenes)
     for what, make in {"shared": shared_blends, "own": own_blends}.items():
         scenes.fit(make(sky, (WARM_SEED, WARM_SEED + 1)))
-        yield timed(what, make(sky, seeds), clock)
+        yield timed(what, make(sky, seeds), clock, options.processes)
     for n_sources in options.blends:
         yield blend_apart(n_sources, options, options.limit)
 
@@ -200,6 +205,7 @@ def parser():
     parser = Parser(__doc__)
     parser.add_flag("quick", f"{N_QUICK} scenes, and the smallest blend")
     parser.add_number("scenes", f"how many scenes ({N_SCENES})")
+    parser.add_number("processes", "that share the scenes and the device", 1)
     about = f"sources of single large blends ({' '.join(map(str, BLENDS))})"
     parser.add("blends", about, nargs="*", type=int, choices=BLENDS, metavar="N")
     about = "only this blend, in this process"

@@ -58,19 +58,28 @@ def test_planted_faults_build(device, fault):
     cl.Kernel(cl.Program(device.context, grind.FAULTS[fault]).build(), fault)
 
 
-def test_a_machine_without_a_device_gets_its_report(tmp_path):
+@pytest.mark.parametrize("fault", ["missing", "hidden"])
+def test_a_machine_without_a_usable_gpu_gets_its_report(tmp_path, fault):
     """Of bench/gpu_check.sh, which is tried in full on machines with a GPU."""
-    report = tmp_path / "report.md"
+    report, library = tmp_path / "report.md", tmp_path / "libnvidia-opencl.so.1"
+    changed = {"CLRESAMPLE_ICD": str(library)}
+    said = f"a driver library that is not there: {library}"
+    if fault == "hidden":
+        if os.environ.get("OCL_ICD_VENDORS"):
+            pytest.skip("the drivers were chosen")
+        library.write_text("")
+        changed = {"LD_LIBRARY_PATH": f"{os.environ.get('LD_LIBRARY_PATH', '')}:{tmp_path}"}
+        said = f"no GPU is used: NVIDIA's OpenCL driver is at {library}"
     answer = subprocess.run(
         [ROOT / "bench" / "gpu_check.sh", report],
-        env={**os.environ, "PYTHON": sys.executable, "CLRESAMPLE_ICD": "/nowhere/lib.so"},
+        env={**os.environ, "PYTHON": sys.executable, **changed},
         capture_output=True,
         text=True,
         check=False,
     )
     assert answer.returncode == 1
-    assert "No device could be opened" in report.read_text()
-    assert "a driver library that is not there: /nowhere/lib.so" in report.read_text()
+    assert "No GPU could be used" in report.read_text()
+    assert said in report.read_text()
     assert f"gpu_check: {report}" in answer.stderr
 
 

@@ -13,6 +13,7 @@ import signal
 import threading
 import traceback
 import warnings
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 
@@ -24,6 +25,7 @@ from .discovery import DeviceError, choose, find_devices, n_host_cores
 from .workers.crew import TaskQueue
 from .workers.outcome import Cause, Reason
 from .workers.pool import WorkerPool
+from .workers.process_limits import thread_environment
 
 # Items of a device's first portion, before its speed is known.
 FIRST_BATCH = 4
@@ -202,13 +204,18 @@ class _Portions(TaskQueue):
 class _DevicePool(WorkerPool):
     """A process for each device, which is lost with its first failure.
 
+    Processes of one CPU device share its threads: with all of them each, launches wait for threads
+    that other processes' launches keep from running.
+
     devices: name and index of each
     """
 
     FAULTS, MAX_FAULTS = (Cause.DEVICE, Cause.WORKER), 1
 
     def __init__(self, devices):
-        super().__init__(len(devices), environment={}, setup=_interruptible, reason_of=_failed)
+        most = max(Counter(devices).values())  # processes that share a device
+        given = {"environment": thread_environment(most), "setup": _interruptible}
+        super().__init__(len(devices), **given, reason_of=_failed)
         self.devices, self.faults = devices, []
 
     def drop(self, worker, reason):
