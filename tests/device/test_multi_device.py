@@ -13,6 +13,7 @@ from clresample.deblending import batch
 from clresample.device import multi_device
 from clresample.device.device_cache import DeviceWarning
 from clresample.device.multi_device import (
+    _DevicePool,
     _Portions,
     distribute,
     iterate_threads,
@@ -70,6 +71,12 @@ def test_everything_is_done_once_and_in_order(device):
     pids = {pid for _, pid in results}
     assert len(pids) == 2 and os.getpid() not in pids
     assert seen == sorted(seen) and seen[-1] == 30
+
+
+def test_processes_of_one_device_share_its_threads():
+    share = str(max(1, (os.cpu_count() or 1) // 2))
+    assert _DevicePool([("cpu", 0)] * 2).environment["POCL_MAX_PTHREAD_COUNT"] == share
+    assert "POCL_MAX_PTHREAD_COUNT" not in _DevicePool([("cpu", 0), ("gpu", 1)]).environment
 
 
 def test_an_error_is_raised_by_name_when_nobody_is_left(device):
