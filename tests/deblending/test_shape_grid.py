@@ -10,7 +10,13 @@ from clresample import ExtendedSource, Grid, Observation, Settings, deblend
 from clresample.deblending.profiles import profile, psf_second_moment
 from clresample.deblending.start import profile_fit, shape_grid
 from clresample.deblending.start.population import LEARNED, PopulationPrior
-from clresample.deblending.start.shape_grid import LN_BETA, SIZE_STEPS, UNUSUAL, ShapeGrid
+from clresample.deblending.start.shape_grid import (
+    FAR_STEPS,
+    LN_BETA,
+    SIZE_STEPS,
+    UNUSUAL_IN_ERRORS,
+    ShapeGrid,
+)
 
 SHAPE, SIDE_PX = (64, 64), 160
 PLACES = (31.3, 32.1), (14.0, 40.0)
@@ -144,13 +150,14 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
 def grid():
     """Makes a ShapeGrid with these gains (size, wings), and a fit for it with usual galaxies."""
 
-    def made(gain, contamination=1.0):
-        theta = shape_grid._alternatives(np.array([0.0, 0.1, -0.2, 1.9]), far=False)
+    def made(gain, contamination=1.0, far=()):
+        theta = shape_grid._alternatives(np.array([0.0, 0.1, -0.2, 1.9]), far=len(far) > 0)
         shape = SimpleNamespace(mean=np.array([0, 0, 0, 1.9]), scatter=np.array([0.4, 1, 1, 0.7]))
         prior = PopulationPrior([shape], [0], [0], 1, 1, 4)
         prior.contamination[0, 0] = contamination
         flux = np.exp(theta[:, :1] - theta[:, 3:])
-        gains = np.append(50.0, np.broadcast_to(gain, (len(SIZE_STEPS), len(LN_BETA))).ravel())
+        near = np.broadcast_to(gain, (len(SIZE_STEPS), len(LN_BETA))).ravel()
+        gains = np.concatenate([[50.0], near, far])
         return ShapeGrid(0, 0, theta, gains, flux), SimpleNamespace(population=prior)
 
     return made
@@ -164,7 +171,8 @@ def test_a_usual_galaxy_stays_and_its_error_holds_the_distance(grid):
     np.testing.assert_array_equal(theta, found.theta[0])
     away = (found.theta[1:][:, LEARNED] - [0, 1.9]) / [0.4, 0.7]
     prior = np.exp(-(away**2).sum(1) / 2) / (2 * np.pi * 0.28)
-    weight = np.exp(gain.ravel() / 4) * ((1 - UNUSUAL) * prior + UNUSUAL / 12)
+    fraction = UNUSUAL_IN_ERRORS
+    weight = np.exp(gain.ravel() / 4) * ((1 - fraction) * prior + fraction / 12)
     expected = np.average((found.flux[1:] - found.flux[0]) ** 2, axis=0, weights=weight)
     np.testing.assert_allclose(scatter, np.sqrt(expected))
 
@@ -178,6 +186,19 @@ def test_an_unusual_galaxy_gets_the_mean(grid):
     np.testing.assert_allclose(theta, [0.9, 0.1, -0.2, LN_BETA[3]], atol=1e-3)
     one, other = found.flux[[1 + 4 * 4 + 3, 1 + 6 * 4 + 3]]
     np.testing.assert_allclose(scatter, (other - one) / 2, rtol=1e-3)
+
+
+def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(grid):
+    """The present profile stays, though unusual ones fit better; each far one counts as eight."""
+    gain = np.full((len(SIZE_STEPS), len(LN_BETA)), -90.0)
+    gain[6, 3] = 20
+    found, fit = grid(gain, far=np.full(len(FAR_STEPS), 20.0))
+    found.gain[0] = 0
+    theta, scatter = found.posterior(fit)
+    np.testing.assert_array_equal(theta, found.theta[0])
+    at = [7 * 4, *range(29, 33)]
+    expected = np.average((found.flux[at] - found.flux[0]) ** 2, axis=0, weights=[1, 8, 8, 8, 8])
+    np.testing.assert_allclose(scatter, np.sqrt(expected), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
