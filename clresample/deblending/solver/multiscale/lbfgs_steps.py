@@ -210,11 +210,13 @@ def _runs(places, of):
     direction of a run begins.
     """
     order = np.argsort(places, kind="stable")
-    variables, first, count = np.unique(places[order], return_index=True, return_counts=True)
-    owner, at = np.repeat(np.arange(len(variables)), count), np.arange(len(order))
+    sorted_places, of, at = places[order], of[order], np.arange(len(order))
+    first = np.flatnonzero(np.diff(sorted_places, prepend=-1))
+    variables, count = sorted_places[first], np.diff(first, append=len(order))
+    owner = np.repeat(np.arange(len(variables)), count)
     # elements whose direction is not that of the next variable's element in the same place
     after = np.minimum(at + count[owner], len(at) - 1)
-    unlike = np.bincount(owner, of[order[after]] != of[order], len(variables)) > 0
+    unlike = np.add.reduceat(of[after] != of, first) > 0
     joined = (np.diff(variables) == 1) & (np.diff(count) == 0) & ~unlike[:-1]
     joined &= variables[1:] % MAX_RUN != 0
     start = np.flatnonzero(np.append(True, ~joined))
