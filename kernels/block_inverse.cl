@@ -11,13 +11,15 @@
  *           the first axis because GPUs limit the groups along other axes
  *
  * Directions d of few variables add d d^T to these inverses, a variable's terms in their order.
+ * A run is variables side by side in the same directions.
  *   owner     (m,) int: the scene of each direction;  totals (m, 2): d . y and d . P g_new
  * direction_products  totals, 0 of idle scenes; ends (m + 1,) int: first of each direction's
  *           elements, then the number of all;  places (k,) int and d (k,): the elements' variables
  *           and values;  launch: (WG m,), a group a direction
- * add_directions  the directions' terms added to H y and H P g_new, variable by variable:
- *           variables (n,) int, first (n + 1,) int: of their elements, then the number of all;
- *           of (k,) int and values (k,): the elements' directions and values;  launch: FOR_I over n
+ * add_directions  the directions' terms added to H y and H P g_new, run by run:
+ *           runs (n + 1, 4) int: first variable, number of variables, first of `of`, first of
+ *           `values`, and after the last run the ends;  of (k,) int: the directions of each run;
+ *           values: of a run's variables, direction by direction;  launch: (LANES n,) at least
  */
 #include "common.h"
 #include "boxes.h"
@@ -27,6 +29,9 @@
 #endif
 #ifndef PANEL       /* rows of a root that have one length; SUM8 is for 8 */
 #define PANEL 8
+#endif
+#ifndef LANES       /* work-items of a run */
+#define LANES 1
 #endif
 #define REST 0
 
@@ -178,23 +183,24 @@ void direction_products(__global const int *restrict owner, __global const int *
     }
 }
 
-__kernel void add_directions(__global const int *restrict variables,
-            __global const int *restrict first, __global const int *restrict of,
+__kernel void add_directions(__global const int *restrict runs, __global const int *restrict of,
             __global const REAL *restrict values, __global const int *restrict owner,
             __global const int *restrict plan, const ulong size, const int n,
             __global const REAL *restrict totals, __global REAL *restrict ring_hy,
             __global REAL *restrict hg_new)
 {
-    FOR_I(i, n) {
-        const int b = owner[of[first[i]]], at = variables[i];
-        if (plan[3 * b] == REST) continue;
-        __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size;
-        REAL sum_y = hy[at], sum_p = hg_new[at];
-        for (int k = first[i]; k < first[i + 1]; ++k) {
-            sum_y += values[k] * totals[2 * of[k]];
-            sum_p += values[k] * totals[2 * of[k] + 1];
+    const int i = (int)get_global_id(0) / LANES, lane = (int)get_global_id(0) % LANES;
+    if (i >= n) return;
+    __global const int *run = runs + 4 * i;
+    const int m = run[1], end = run[6], b = owner[of[run[2]]];
+    if (plan[3 * b] == REST) return;
+    __global const REAL *d = values + run[3];
+    __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size + run[0], *hg = hg_new + run[0];
+    for (int k = run[2]; k < end; ++k, d += m) {
+        const REAL total_y = totals[2 * of[k]], total_p = totals[2 * of[k] + 1];
+        for (int j = lane; j < m; j += LANES) {
+            hy[j] += d[j] * total_y;
+            hg[j] += d[j] * total_p;
         }
-        hy[at] = sum_y;
-        hg_new[at] = sum_p;
     }
 }

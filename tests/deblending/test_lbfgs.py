@@ -5,6 +5,7 @@ import pytest
 from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.multiscale import lbfgs_steps
 from clresample.deblending.solver.multiscale.exchange_direction import ExchangeDirection
 from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, SourceBlocks, _panels
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
@@ -246,6 +247,23 @@ def test_a_scene_that_is_no_number_harms_no_other(build, dtype):
         m.steps.advance(*np.zeros((2, 3, 5)), *np.zeros((2, 3)))
         found.append(np.vstack([m.get("hy"), m.get("hg")])[:, m.scene == 0])
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("most", [5, 1000])
+def test_runs_hold_every_element_once_and_are_as_long_as_directions_allow(most, monkeypatch):
+    monkeypatch.setattr(lbfgs_steps, "MAX_RUN", most)
+    of = np.repeat([0, 1, 2], [20, 6, 4])
+    places = np.concatenate([np.arange(20), [4, 5, 6, 7, 12, 30], [6, 13, 30, 31]])
+    runs, order, firsts = lbfgs_steps._runs(places, of)
+    found = [
+        (first + k % length, int(of[order[firsts[of_run]]]))
+        for (first, length, of_run, at), (*_, to) in zip(runs, runs[1:], strict=False)
+        for k, of_run in zip(range(to - at), np.repeat(range(of_run, of_run + 3), length))
+    ]
+    assert found == list(zip(places[order], of[order], strict=True))
+    assert sorted(order) == list(range(len(of))) and tuple(runs[-1, 2:]) == (len(firsts), len(of))
+    first = [0, 4, 6, 7, 8, 12, 13, 14, 30, 31]
+    assert runs[:-1, 0].tolist() == sorted({*first, *range(0, 20, most), *range(30, 32, most)})
 
 
 def test_only_new_roots_are_uploaded(build, monkeypatch):

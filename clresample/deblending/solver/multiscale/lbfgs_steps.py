@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....device.rounding import round_up
 from ..boxes import ALIGN
 from .factor_store import FactorStore
 from .inverse import MAX_BLOCK_SIZE, PANEL
 
 # What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
+# Largest number of variables of a run of directions, so that several cores share those of a source;
+# and work-items of a run on GPUs.
+MAX_RUN, RUN_LANES = 2048, 32
 
 
 class LbfgsSteps:
@@ -51,7 +55,8 @@ class LbfgsSteps:
             projected=projected,
             hg_new=hg_new,
         )
-        macros = {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "WG": group}
+        self._lanes = 1 if b.tuning.row_loops else RUN_LANES
+        macros = {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL, "LANES": self._lanes, "WG": group}
         products = {"plan": self._plan, "y": y, "projected": projected}
         added = {"plan": self._plan, "size": v.size, "ring_hy": v.hy, "hg_new": hg_new}
         self._invert, self._multiply_directions, self._add_directions = (
@@ -173,9 +178,8 @@ class LbfgsSteps:
             return
         scene, places, values = zip(*directions, strict=True)
         lengths = [len(at) for at in places]
+        of = np.repeat(np.arange(len(scene)), lengths)
         places, values = np.concatenate(places), np.concatenate(values)
-        order = np.argsort(places, kind="stable")
-        variables, first = np.unique(places[order], return_index=True)
         both = {"owner": b.device.put(np.array(scene), np.int32)}
         both["totals"] = b.device.empty((len(scene), 2), b.dtype)
         self._multiply_directions.bind(
@@ -184,12 +188,46 @@ class LbfgsSteps:
             places=b.device.put(places, np.int32),
             d=b.put(values),
         )
+        runs, order, firsts = _runs(places, of)
+        n = len(runs) - 1
         self._add_directions.bind(
             **both,
-            n=len(variables),
-            variables=b.device.put(variables, np.int32),
-            first=b.device.put(np.append(first, len(places)), np.int32),
-            of=b.device.put(np.repeat(np.arange(len(scene)), lengths)[order], np.int32),
+            n=n,
+            runs=b.device.put(runs, np.int32),
+            of=b.device.put(of[order[firsts]], np.int32),
             values=b.put(values[order]),
         )
-        self._directions = (self._size[0] * len(scene),), b.items(len(variables))
+        launched = round_up(n * self._lanes, *b.tuning.local_size(1))
+        self._directions = (self._size[0] * len(scene),), (launched,)
+
+
+def _runs(places, of):
+    """Runs (n + 1, 4) of variables side by side in the same directions, see block_inverse.cl.
+
+    places, of (k,): variable and direction of each element
+
+    Also returns the elements (k,) in the order of the runs, and those of them (m,) with which a
+    direction of a run begins.
+    """
+    order = np.argsort(places, kind="stable")
+    sorted_places, of, at = places[order], of[order], np.arange(len(order))
+    first = np.flatnonzero(np.diff(sorted_places, prepend=-1))
+    variables, count = sorted_places[first], np.diff(first, append=len(order))
+    owner = np.repeat(np.arange(len(variables)), count)
+    # elements whose direction is not that of the next variable's element in the same place
+    after = np.minimum(at + count[owner], len(at) - 1)
+    unlike = np.add.reduceat(of[after] != of, first) > 0
+    joined = (np.diff(variables) == 1) & (np.diff(count) == 0) & ~unlike[:-1]
+    joined &= variables[1:] % MAX_RUN != 0
+    start = np.flatnonzero(np.append(True, ~joined))
+    length = np.diff(start, append=len(variables))
+    run = np.repeat(np.arange(len(start)), length)[owner]
+    direction, variable = at - first[owner], owner - start[run]
+    to = first[start][run] + direction * length[run] + variable
+    ordered = np.empty_like(order)
+    ordered[to] = order
+    terms = np.cumsum([0, *count[start]])
+    rows = [variables[start], length, terms[:-1], first[start]]
+    runs = np.column_stack([np.append(row, 0) for row in rows])
+    runs[-1, 2:] = terms[-1], len(order)
+    return runs, ordered, np.sort(to[variable == 0])
