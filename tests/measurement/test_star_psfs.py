@@ -71,10 +71,11 @@ def test_a_star_whose_wings_reach_the_edge_has_a_psf_of_its_own():
     assert image.observation.psf_field.flux_error[0, 0] > 0
 
 
-def test_a_small_core_has_the_psf_within_its_image_and_a_halo_beyond():
+@pytest.mark.parametrize("spacing_px", [1.0, 0.5])
+def test_a_small_core_has_the_psf_within_its_image_and_a_halo_beyond(spacing_px):
     """Light of spikes beyond the image is not added to that of the PSF, which has them too."""
     given = {"size": 121, "half_px": 20, "fluxes": [4e6], "levels": [3e4], "light": with_spikes}
-    image, _, n_own, star = star_psfs(**given)
+    image, _, n_own, star = star_psfs(**given, spacing_px=spacing_px)
     assert not n_own.any()
     own = image.observation.psf_field.psf_at(*star)
     along = np.arange(1.0, 28.0)  # a spike
@@ -94,6 +95,12 @@ def test_a_wide_core_in_one_channel_makes_a_star_of_all_of_them():
     assert min(light) > 0.5 * moffat(20, 0, 4.0)
     image, *n, _ = star_psfs(ExtendedSource, **{**given, "fluxes": [4e6, 4e6]})
     assert image.observation.psf_field is None and not np.any(n)
+
+
+def test_a_faint_dark_ring_with_a_brighter_one_beyond_is_of_diffraction():
+    given = {"size": 61, "half_px": 20, "fluxes": [5e5], "levels": [1e3]}
+    _, n_wide, n_own, _ = star_psfs(**given, light=with_rings, spacing_px=0.5)
+    assert (n_wide, n_own) == (1, 0)
 
 
 def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
