@@ -115,8 +115,10 @@ def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
     assert not [message for message in found.messages if "sky" in message]
 
 
-def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it():
-    """sum w m L / sum w m^2 flux, of a source of two components, and of one without flux."""
+@pytest.mark.parametrize("star, place", [(0, None), (2, None), (0, (1.3, 2.6))])
+def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(star, place):
+    """|sum w m (L, r . grad L)| / sum w m^2 flux: of sources of two components, without flux, and
+    only partly in a star's light; no source has that of its own."""
     rng, psf_error = np.random.default_rng(2), 0.03
     low, spectra = [(0, 0), (1, 0), (2, 3), (0, 2)], np.array([[9e3, 4e3], [3, 2], [1, 5], [0, 0]])
     images = [rng.random((2, *size)) for size in ((5, 6), (3, 4), (2, 3), (5, 4))]
@@ -133,13 +135,21 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it()
         observations=[SimpleNamespace(weights=weights)],
         sources=range(3),
     )
-    found = _neighbour_errors(result, 0, 0, owner, psf_error)
-    light = spectra[0][:, None, None] * rendered[0]
-    w = used / (1 / weights + (psf_error * light) ** 2)
-    several = spectra[1][:, None, None] * rendered[1] + spectra[2][:, None, None] * rendered[2]
-    models = (several, 3 * spectra[1] + 2 * spectra[2]), (rendered[3], 4.0)
+    found = _neighbour_errors(result, 0, star, owner, psf_error, place)
+    changes = [spectra[star][:, None, None] * rendered[star]]
+    if place:
+        y, x = np.indices((5, 6))
+        slopes = np.gradient(changes[0], axis=(1, 2))
+        changes.append((y - place[0]) * slopes[0] + (x - place[1]) * slopes[1])
+    w = used / (1 / weights + psf_error**2 * sum(change**2 for change in changes))
+    bright = spectra[:, :, None, None] * rendered
+    flux = sums[:, None] * spectra
+    models = [(bright[0], flux[0]), (bright[1] + bright[2], flux[1] + flux[2]), (rendered[3], 4.0)]
     wanted = [
-        (w * model * light).sum((1, 2)) / (w * model**2).sum((1, 2)) * flux
+        np.hypot(*[(w * model * one).sum((1, 2)) for one in (*changes, 0 * changes[0])[:2]])
+        / (w * model**2).sum((1, 2))
+        * flux
         for model, flux in models
     ]
-    np.testing.assert_allclose(found, [[0, 0], *wanted])
+    wanted[owner[star]] = [0, 0]
+    np.testing.assert_allclose(found, wanted)
