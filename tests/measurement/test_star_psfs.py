@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.assessment.cores import _neighbour_errors
+from clresample.deblending.assessment.cores import _model, _neighbour_errors
 from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.inspection.image import InspectedImage
@@ -135,7 +135,8 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(s
         observations=[SimpleNamespace(weights=weights)],
         sources=range(3),
     )
-    found = _neighbour_errors(result, 0, star, owner, psf_error, place)
+    others = {s: _model(result, 0, np.flatnonzero(owner == s)) for s in {0, 1, 2} - {owner[star]}}
+    found = _neighbour_errors(result, 0, star, others, psf_error, place)
     changes = [spectra[star][:, None, None] * rendered[star]]
     if place:
         y, x = np.indices((5, 6))

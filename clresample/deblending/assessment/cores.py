@@ -31,23 +31,42 @@ def core_errors(result, psf_error) -> np.ndarray:
     for i, observation in enumerate(result.observations):
         field, channels = observation.psf_field, result.channel_slices()[i]
         there = result.frame.grid.positions_in(observation.grid, *positions.T)
+        models = {s: _model(result, i, np.flatnonzero(owner == s)) for s in np.unique(owner)}
         for k in stars:
-            component, place = result.components[k], there[owner[k]]
+            source, place = owner[k], there[owner[k]]
             star = field.number_at(*place) if isinstance(field, StarPSFs) else None
             if star is not None:
+                component = result.components[k]
                 flux = np.abs(component.spectrum[channels]) * component.morphology.sum()
                 own = field.flux_error[star] * flux
-                found[owner[k], channels] = np.hypot(found[owner[k], channels], own)
+                found[source, channels] = np.hypot(found[source, channels], own)
             # wings that were measured do not follow from the width of a core
             is_measured = star is not None and not field.keeps_core[star]
+            others = {s: model for s, model in models.items() if s != source}
             errors = _neighbour_errors(
-                result, i, k, owner, psf_error, None if is_measured else place
+                result, i, k, others, psf_error, None if is_measured else place
             )
             found[:, channels] = np.hypot(found[:, channels], errors)
     return psf_error * found
 
 
-def _neighbour_errors(result, i, k, owner, psf_error, place):
+def _model(result, i, parts):
+    """Window (slices y, x), model (Co, ny, nx) and flux (Co,) in observation i of some components.
+
+    Those of all components together, of a brightness of 1 in channels without flux.
+    """
+    rendered, channels = result.rendered[i], result.channel_slices()[i]
+    spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
+    spectra = np.where(spectra.any(axis=0), spectra, 1.0)
+    flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
+    sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
+    window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
+    images = (image_within(rendered, j, window) for j in parts)
+    model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
+    return window, model, flux
+
+
+def _neighbour_errors(result, i, k, models, psf_error, place):
     """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
 
         |sum_pixels w m (L, r . grad L)| / sum_pixels w m^2 flux
@@ -55,7 +74,8 @@ def _neighbour_errors(result, i, k, owner, psf_error, place):
 
     in observation i, for the model m of a source with this flux, of any brightness. Unlike noise,
     the star's light is too bright by psf_error, and its PSF too wide, all over m.
-    place (2,) [px]: of the star, from which r is; None leaves the width out
+    models: {s: `_model`} of the other sources; place (2,) [px]: of the star, from which r is; None
+        leaves the width out
     """
     rendered, channels = result.rendered[i], result.channel_slices()[i]
     weights = np.where(result.footprints[i].used, result.observations[i].weights, 0.0)
@@ -64,24 +84,17 @@ def _neighbour_errors(result, i, k, owner, psf_error, place):
     changes = [spectrum * image_within(rendered, k, own)]
     if place is not None:
         changes.append(_widening(changes[0], [np.mgrid[own][a] - place[a] for a in (0, 1)]))
-    square = psf_error**2 * sum(change**2 for change in changes)
-    if not (weights[:, *own] * square).max(initial=0.0) > MIN_PSF_ERROR_SIGMA**2:
+    lowered = 1 + weights[:, *own] * psf_error**2 * sum(change**2 for change in changes)
+    if not lowered.max(initial=1.0) > 1 + MIN_PSF_ERROR_SIGMA**2:
         return out
-    weights[:, *own] /= 1 + weights[:, *own] * square
-    for s in np.unique(owner[owner != owner[k]]):
-        parts = np.flatnonzero(owner == s)
-        sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
-        window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
+    weights[:, *own] /= lowered
+    for s, (window, model, flux) in models.items():
         shared = _overlap(window, own)
         if shared is None:
             continue
-        spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
-        spectra = np.where(spectra.any(axis=0), spectra, 1.0)
-        images = (image_within(rendered, j, window) for j in parts)
-        model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
-        weighted, power = weights[:, *window] * model, (weights[:, *window] * model**2).sum((1, 2))
+        weighted = weights[:, *window] * model
+        power = (weighted * model).sum((1, 2))
         sums = [(weighted[:, *shared[0]] * one[:, *shared[1]]).sum((1, 2)) for one in changes]
-        flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
         right = np.linalg.norm(sums, axis=0) * flux
         out[s] = np.divide(right, power, out=np.zeros_like(right), where=power > 0)
     return out
