@@ -34,8 +34,8 @@ N_PSFS, N_WAVES = 32, 17  # of cached results of `is_aliased`, and of waves alon
 def sampled_psfs(frame, observations, position) -> tuple:
     """PSFs at a position (2,) [px of the frame] of all observations on whose pixels it lies.
 
-    Only those of PSFs that are `is_aliased`. Stars with PSFs of their own are left out: these were
-    measured on the pixels themselves.
+    Only those of PSFs that are `is_aliased`. Stars whose PSFs of their own do not keep the core
+    are left out: these were measured on the pixels themselves.
     """
     found = []
     pixels = np.asarray(position) + [[0, 0], [1, 0], [0, 1]]
@@ -48,7 +48,9 @@ def sampled_psfs(frame, observations, position) -> tuple:
             continue
         field, place = o.psf_field, np.clip(places[0], 0, np.array(o.data.shape[1:]) - 1)
         if isinstance(field, StarPSFs):
-            found += [field.passed_at(*place)] if field.number_at(*place) is None else []
+            star = field.number_at(*place)
+            keeps_core = star is None or field.keeps_core[star]
+            found += [field.passed_at(*place)] if keeps_core else []
         else:
             found.append(o.psf if field is None else field.psf_at(*place))
     return tuple(psf for psf in found if is_aliased(psf))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from clresample.deblending.assessment.cores import core_errors
 from clresample.deblending.batch import deblend
 from clresample.deblending.inspection.star_psfs import StarPSFs
 from clresample.deblending.profiles import ALIAS_PX, GalaxyProfile, StarProfile, draw_psf
@@ -97,18 +98,21 @@ def test_psfs_are_of_observations_on_the_frames_pixels(psf, grid, n):
     assert len(found) == n
 
 
-def test_stars_with_psfs_of_their_own_are_left_out():
+@pytest.mark.parametrize("keeps_core", [False, True])
+def test_stars_with_psfs_of_their_own_are_left_out_unless_they_keep_the_core(keeps_core):
     psf, place = pixel_psf(), np.array([20.3, 22.4])
-    field = StarPSFs(
-        psf, None, place[None], (PSF.gaussian(2.0),), np.zeros((1, 1)), np.zeros(1, bool)
-    )
+    own = (PSF.gaussian(2.0),)
+    field = StarPSFs(psf, None, place[None], own, np.zeros((1, 1)), np.array([keeps_core]))
     home, one = Frame(GRID, model_psf(0.8)), with_psf_field(observation(), field)
-    assert sampled_psfs(home, [one], place) == ()
+    assert sampled_psfs(home, [one], place) == ((psf,) if keeps_core else ())
     assert sampled_psfs(home, [one], place + 5) == (psf,)
 
 
 def test_a_galaxy_beside_a_star_has_its_flux_however_finely_the_psf_is_sampled():
-    """Without waves that pixels alias the star's model is exact for its neighbours."""
+    """Without waves that pixels alias the star's model is exact for its neighbours.
+
+    Their errors hold that of the PSF beside a star of any brightness.
+    """
     star, at, fwhm_px, shape = np.array([24.3, 27.6]), np.array([18.3, 29.6]), 4.0, (49, 53)
     y, x = np.indices(shape)
 
@@ -128,6 +132,8 @@ def test_a_galaxy_beside_a_star_has_its_flux_however_finely_the_psf_is_sampled()
         one = Observation(data, psf, Grid.flat(shape, 0.26), weights=1 / 25, channels=("r",))
         result = deblend([one], [PointSource(position_px=star), ExtendedSource(position_px=at)])
         found.append((result.components[1].flux[0], result.errors.flux[0, 1, 1] ** 0.5))
+        by_star = core_errors(result, 0.03)[:, 0]
+        assert by_star[0] == 0 < 0.03 * flux < by_star[1] < found[-1][1]
     for galaxy, error in found:
         assert abs(galaxy - flux) < max(2 * error, 0.1 * flux)
     assert abs(found[0][0] - found[1][0]) < 0.5 * found[0][1]

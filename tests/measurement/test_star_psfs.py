@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.assessment.cores import _neighbour_errors
+from clresample.deblending.assessment.cores import _model, _neighbour_errors
 from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.inspection.image import InspectedImage
@@ -71,10 +71,11 @@ def test_a_star_whose_wings_reach_the_edge_has_a_psf_of_its_own():
     assert image.observation.psf_field.flux_error[0, 0] > 0
 
 
-def test_a_small_core_has_the_psf_within_its_image_and_a_halo_beyond():
+@pytest.mark.parametrize("spacing_px", [1.0, 0.5])
+def test_a_small_core_has_the_psf_within_its_image_and_a_halo_beyond(spacing_px):
     """Light of spikes beyond the image is not added to that of the PSF, which has them too."""
     given = {"size": 121, "half_px": 20, "fluxes": [4e6], "levels": [3e4], "light": with_spikes}
-    image, _, n_own, star = star_psfs(**given)
+    image, _, n_own, star = star_psfs(**given, spacing_px=spacing_px)
     assert not n_own.any()
     own = image.observation.psf_field.psf_at(*star)
     along = np.arange(1.0, 28.0)  # a spike
@@ -96,6 +97,12 @@ def test_a_wide_core_in_one_channel_makes_a_star_of_all_of_them():
     assert image.observation.psf_field is None and not np.any(n)
 
 
+def test_a_faint_dark_ring_with_a_brighter_one_beyond_is_of_diffraction():
+    given = {"size": 61, "half_px": 20, "fluxes": [5e5], "levels": [1e3]}
+    _, n_wide, n_own, _ = star_psfs(**given, light=with_rings, spacing_px=0.5)
+    assert (n_wide, n_own) == (1, 0)
+
+
 def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
     """Its light in the whole image leaves the sky's level open."""
     given = {"size": 61, "half_px": 20, "fluxes": [2e7], "levels": [3e4]}
@@ -103,13 +110,15 @@ def test_a_star_with_rings_that_rise_is_a_star_with_the_psf_passed():
     blend = Blend([observation], [ExtendedSource(position_px=tuple(star))])
     found = inspect(blend, model_frame([observation]), star[None], np.zeros((1, 2)), Settings())
     assert [type(source) for source in found.blend.sources] == [PointSource]
-    assert found.blend.observations[0].psf_field is None
+    assert found.blend.observations[0].psf_field.keeps_core.all()
     assert np.isinf(found.levels[0].error).all()
     assert not [message for message in found.messages if "sky" in message]
 
 
-def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it():
-    """sum w m L / sum w m^2 flux, of a source of two components, and of one without flux."""
+@pytest.mark.parametrize("star, place", [(0, None), (2, None), (0, (1.3, 2.6))])
+def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(star, place):
+    """|sum w m (L, r . grad L)| / sum w m^2 flux: of sources of two components, without flux, and
+    only partly in a star's light; no source has that of its own."""
     rng, psf_error = np.random.default_rng(2), 0.03
     low, spectra = [(0, 0), (1, 0), (2, 3), (0, 2)], np.array([[9e3, 4e3], [3, 2], [1, 5], [0, 0]])
     images = [rng.random((2, *size)) for size in ((5, 6), (3, 4), (2, 3), (5, 4))]
@@ -126,13 +135,22 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it()
         observations=[SimpleNamespace(weights=weights)],
         sources=range(3),
     )
-    found = _neighbour_errors(result, 0, 0, owner, psf_error)
-    light = spectra[0][:, None, None] * rendered[0]
-    w = used / (1 / weights + (psf_error * light) ** 2)
-    several = spectra[1][:, None, None] * rendered[1] + spectra[2][:, None, None] * rendered[2]
-    models = (several, 3 * spectra[1] + 2 * spectra[2]), (rendered[3], 4.0)
+    others = {s: _model(result, 0, np.flatnonzero(owner == s)) for s in {0, 1, 2} - {owner[star]}}
+    found = _neighbour_errors(result, 0, star, others, psf_error, place)
+    changes = [spectra[star][:, None, None] * rendered[star]]
+    if place:
+        y, x = np.indices((5, 6))
+        slopes = np.gradient(changes[0], axis=(1, 2))
+        changes.append((y - place[0]) * slopes[0] + (x - place[1]) * slopes[1])
+    w = used / (1 / weights + psf_error**2 * sum(change**2 for change in changes))
+    bright = spectra[:, :, None, None] * rendered
+    flux = sums[:, None] * spectra
+    models = [(bright[0], flux[0]), (bright[1] + bright[2], flux[1] + flux[2]), (rendered[3], 4.0)]
     wanted = [
-        (w * model * light).sum((1, 2)) / (w * model**2).sum((1, 2)) * flux
+        np.hypot(*[(w * model * one).sum((1, 2)) for one in (*changes, 0 * changes[0])[:2]])
+        / (w * model**2).sum((1, 2))
+        * flux
         for model, flux in models
     ]
-    np.testing.assert_allclose(found, [[0, 0], *wanted])
+    wanted[owner[star]] = [0, 0]
+    np.testing.assert_allclose(found, wanted)

@@ -1,4 +1,4 @@
-"""Errors of fluxes beside saturated stars, and of these stars, whose cores follow from wings."""
+"""Errors of fluxes beside stars, and of saturated stars, whose cores follow from wings."""
 
 from __future__ import annotations
 
@@ -6,65 +6,118 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...sky.sources import PointSource
 from ..component_images import image_within, window_of
 from ..inspection.star_psfs import StarPSFs
+from ..start.star_weights import MIN_PSF_ERROR_SIGMA
 
 
 def core_errors(result, psf_error) -> np.ndarray:
-    """Errors (S, C) [counts] of fluxes by the PSFs of their own that saturated stars have.
+    """Errors (S, C) [counts] of fluxes by the errors of stars' PSFs.
 
         psf_error |p - 2| flux,    p: power of the distance by which the light falls beside the core
 
-    of the stars: if a PSF's width grows by the fraction epsilon, its light there grows by (p - 2)
-    epsilon. Their neighbours have those of `_neighbour_errors`.
+    of saturated stars with a PSF of their own: if its width grows by the fraction epsilon, its
+    light there grows by (p - 2) epsilon. Neighbours of all stars have those of `_neighbour_errors`.
 
     psf_error [1]: see Settings
     """
     found = np.zeros((len(result.sources), len(result.channels)))
-    positions = np.asarray(result.frame.positions_of(result.sources))
     owner = np.array([c.source for c in result.components], int)
+    stars = [k for k, s in enumerate(owner) if isinstance(result.sources[s], PointSource)]
+    if not stars:
+        return found
+    positions = np.asarray(result.frame.positions_of(result.sources))
     for i, observation in enumerate(result.observations):
         field, channels = observation.psf_field, result.channel_slices()[i]
-        if not isinstance(field, StarPSFs):
-            continue
         there = result.frame.grid.positions_in(observation.grid, *positions.T)
-        for k, c in enumerate(result.components):
-            star = field.number_at(*there[c.source])
+        models = {s: _model(result, i, np.flatnonzero(owner == s)) for s in np.unique(owner)}
+        for k in stars:
+            source, place = owner[k], there[owner[k]]
+            star = field.number_at(*place) if isinstance(field, StarPSFs) else None
             if star is not None:
-                flux = np.abs(c.spectrum[channels]) * c.morphology.sum()
+                component = result.components[k]
+                flux = np.abs(component.spectrum[channels]) * component.morphology.sum()
                 own = field.flux_error[star] * flux
-                others = _neighbour_errors(result, i, k, owner, psf_error)
-                found[:, channels] = np.hypot(found[:, channels], others)
-                found[c.source, channels] = np.hypot(found[c.source, channels], own)
+                found[source, channels] = np.hypot(found[source, channels], own)
+            # wings that were measured do not follow from the width of a core
+            is_measured = star is not None and not field.keeps_core[star]
+            others = {s: model for s, model in models.items() if s != source}
+            errors = _neighbour_errors(
+                result, i, k, others, psf_error, None if is_measured else place
+            )
+            found[:, channels] = np.hypot(found[:, channels], errors)
     return psf_error * found
 
 
-def _neighbour_errors(result, i, k, owner, psf_error):
-    """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
+def _model(result, i, parts):
+    """Window (slices y, x), model (Co, ny, nx) and flux (Co,) in observation i of some components.
 
-        sum_pixels w m L / sum_pixels w m^2 flux,    1/w = sigma^2 + (psf_error L)^2
-
-    in observation i, for the model m of a source with this flux, of any brightness: unlike noise,
-    the star's light is too bright or too faint by psf_error all over m.
+    Those of all components together, of a brightness of 1 in channels without flux.
     """
     rendered, channels = result.rendered[i], result.channel_slices()[i]
-    light = np.abs(result.components[k].spectrum[channels])[:, None, None] * rendered[k]
+    spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
+    spectra = np.where(spectra.any(axis=0), spectra, 1.0)
+    flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
+    sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
+    window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
+    images = (image_within(rendered, j, window) for j in parts)
+    model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
+    return window, model, flux
+
+
+def _neighbour_errors(result, i, k, models, psf_error, place):
+    """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
+
+        |sum_pixels w m (L, r . grad L)| / sum_pixels w m^2 flux
+        1/w = sigma^2 + psf_error^2 [L^2 + (r . grad L)^2]
+
+    in observation i, for the model m of a source with this flux, of any brightness. Unlike noise,
+    the star's light is too bright by psf_error, and its PSF too wide, all over m.
+    models: {s: `_model`} of the other sources; place (2,) [px]: of the star, from which r is; None
+        leaves the width out
+    """
+    rendered, channels = result.rendered[i], result.channel_slices()[i]
     weights = np.where(result.footprints[i].used, result.observations[i].weights, 0.0)
-    weights = weights / (1 + weights * (psf_error * light) ** 2)
-    out = np.zeros((len(result.sources), len(weights)))
-    for s in np.unique(owner[owner != owner[k]]):
-        parts = np.flatnonzero(owner == s)
-        spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
-        spectra = np.where(spectra.any(axis=0), spectra, 1.0)
-        sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
-        window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
-        images = (image_within(rendered, j, window) for j in parts)
-        model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
+    own, out = window_of(rendered, k, margin=1), np.zeros((len(result.sources), len(weights)))
+    spectrum = np.abs(result.components[k].spectrum[channels])[:, None, None]
+    changes = [spectrum * image_within(rendered, k, own)]
+    if place is not None:
+        changes.append(_widening(changes[0], [np.mgrid[own][a] - place[a] for a in (0, 1)]))
+    lowered = 1 + weights[:, *own] * psf_error**2 * sum(change**2 for change in changes)
+    if not lowered.max(initial=1.0) > 1 + MIN_PSF_ERROR_SIGMA**2:
+        return out
+    weights[:, *own] /= lowered
+    for s, (window, model, flux) in models.items():
+        shared = _overlap(window, own)
+        if shared is None:
+            continue
         weighted = weights[:, *window] * model
-        right, power = ((weighted * b).sum((1, 2)) for b in (light[:, *window], model))
-        flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
-        out[s] = np.divide(right * flux, power, out=np.zeros_like(right), where=power > 0)
+        power = (weighted * model).sum((1, 2))
+        sums = [(weighted[:, *shared[0]] * one[:, *shared[1]]).sum((1, 2)) for one in changes]
+        right = np.linalg.norm(sums, axis=0) * flux
+        out[s] = np.divide(right, power, out=np.zeros_like(right), where=power > 0)
     return out
+
+
+def _widening(light, away):
+    """r . grad L (Co, ny, nx) of light L, by differences of pixels; away: r (y, x), (ny, nx)."""
+    axes = [(axis, r) for axis, r in zip((1, 2), away, strict=True) if light.shape[axis] > 1]
+    return sum((r * np.gradient(light, axis=axis) for axis, r in axes), np.zeros_like(light))
+
+
+def _overlap(*windows):
+    """The part that two windows (slices y, x) share, as slices of each; None without any."""
+    sides = [
+        (max(s.start for s in pair), min(s.stop for s in pair))
+        for pair in zip(*windows, strict=True)
+    ]
+    if any(low >= high for low, high in sides):
+        return None
+    return [
+        tuple(slice(a - s.start, b - s.start) for (a, b), s in zip(sides, window, strict=True))
+        for window in windows
+    ]
 
 
 def with_core_errors(errors, cores):

@@ -21,12 +21,12 @@ class RadialProfile:
 
     log_radius, log_light (n,): of its rings, n > 2. Light is interpolated between them and
     continued by a power of the distance beyond both ends.
-    rises: True if the next ring beyond them is brighter than the last
+    rise: by how much the brightest of the next END_RINGS rings exceeds the last of them, or 0
     """
 
     log_radius: np.ndarray
     log_light: np.ndarray
-    rises: bool = False
+    rise: float = 0.0
 
     @classmethod
     def measure(cls, data, usable, away, sigma):
@@ -34,18 +34,21 @@ class RadialProfile:
 
         Rings end where their light rises or is below RING_SIGMAS. None if fewer than three remain.
         """
-        rings, found, rises = np.rint(away[usable]).astype(int), [], False
-        value, radius = data[usable], away[usable]
+        rings, found = np.rint(away[usable]).astype(int), []
+        value, radius, rise = data[usable], away[usable], 0.0
         for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):
             own = rings == r
             if own.sum() < MIN_RING:
                 continue
             light = np.median(value[own])
-            rises = bool(found) and light > found[-1][1]
-            if rises or light < RING_SIGMAS * sigma:
+            if found and light > found[-1][1]:
+                beyond = (value[rings == k] for k in range(r, r + END_RINGS))
+                rise = max(np.median(v) for v in beyond if v.size >= MIN_RING) - found[-1][1]
+                break
+            if light < RING_SIGMAS * sigma:
                 break
             found.append((np.median(radius[own]), light))
-        return cls(*np.log(found).T, rises) if len(found) > 2 else None
+        return cls(*np.log(found).T, rise) if len(found) > 2 else None
 
     def at(self, radius):
         """Light at distances [px], of any shape; distances below one pixel count as one."""

@@ -54,12 +54,13 @@ MIN_STAR_RADIUS_FWHM = 1.0
 WIDE_GROW_PX = 3
 # [px] Tolerance in the comparison of positions with those of stars, because of rounding.
 SAME_PLACE_PX = 0.5
-# [sigma] Largest light of the last ring of a profile: brighter rings that rise are those of
-# diffraction, which are the PSF's.
-MAX_END_SIGMAS = 30.0
+# [sigma] Smallest rise of light outwards that is a ring of diffraction: a profile that falls cannot
+# have it, and the PSF passed has. Medians of rings are noisy by a tenth of that. With 30, for the
+# ring's own light, stars of Euclid just over saturation had twice their flux.
+MIN_RISE_SIGMAS = 3.0
 # [sigma] Smallest light of a halo at the edge of the PSF's image: fainter ones are not worth the
 # time that a PSF of its own takes in each window of a start.
-MIN_HALO_SIGMAS = 1.0
+MIN_HALO_SIGMAS = 0.25
 # [1] Largest ratio of a halo to the PSF at the edge of its image: more light is of galaxies.
 MAX_HALO_RATIO = 2.0
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
@@ -222,11 +223,7 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
     beside = image.usable[c] & (away >= radius)
     profile = RadialProfile.measure(data, beside, away, image.sigma[c]) if is_wide else None
-    keeps_core = profile is None or (
-        profile.rises and profile.at(profile.end) > MAX_END_SIGMAS * image.sigma[c]
-    )
-    if keeps_core and psf.spacing < 1:
-        return None  # each window of a start would transform all samples of a halo
+    keeps_core = profile is None or profile.rise > MIN_RISE_SIGMAS * image.sigma[c]
     if keeps_core:
         middle, radius = place, inscribed_radius(psf, c)
         away = np.hypot(np.arange(n_y)[:, None] - middle[0], np.arange(n_x) - middle[1])
