@@ -10,6 +10,7 @@ from ..sky.validation.checks import check_instance, check_integer, check_number
 from .iterate import LbfgsRun
 from .solver.multiscale.engine import vector_bytes
 from .solver.multiscale.prior import MultiscalePrior
+from .start.profile_fit import CHI2_TOL
 
 AUTO = "auto"  # fit_shifts: by measurement
 
@@ -34,6 +35,11 @@ class FitSettings:
         check_instance("fit_sky", self.fit_sky, (bool, np.bool_))
         if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
             raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
+
+    @property
+    def start_tol(self) -> float:
+        """Gain in chi2 below which steps of the smooth profiles at the start end."""
+        return CHI2_TOL
 
     def start_run(self, fits, device, dtype, takes_over=None):
         """The run of Fits of one signature that have begun, as `iterate` drives it.
@@ -107,6 +113,11 @@ class Settings(FitSettings):
         check_fraction("flux_error_floor", self.flux_error_floor)
         check_instance("errors", self.errors, (bool, np.bool_))
         check_instance("prior", self.prior, MultiscalePrior)
+
+    @property
+    def start_tol(self) -> float:
+        """See `FitSettings.start_tol`; larger where `loss_tol` is larger than the default."""
+        return max(CHI2_TOL, CHI2_TOL * self.loss_tol / Settings.loss_tol)
 
     def start_run(self, fits, device, dtype, takes_over=None) -> LbfgsRun:
         """See `FitSettings.start_run`."""
