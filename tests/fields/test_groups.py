@@ -155,8 +155,8 @@ def test_a_large_piece_has_many_pixels_times_sources():
 @pytest.mark.parametrize(
     "rough, large, continued, given, most, errors",
     [
-        (True, False, False, {}, 40, False),
-        (True, True, False, {}, 40, False),
+        (True, False, False, {}, 60, False),
+        (True, True, False, {}, 60, False),
         (False, True, False, {}, 150, True),
         (False, True, True, {}, 100, True),
         (False, False, True, {}, 500, True),

@@ -33,7 +33,7 @@ from .group_results import GroupResults
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
 # Iterations of the first fits of a cut blend's pieces. The next round replaces these fits and uses
 # only their light, which it subtracts with an assumed error of 15 % (MODEL_ERROR).
-ROUGH_ITERATIONS = 40
+ROUGH_ITERATIONS = 60
 # `Settings.loss_tol` of these fits: 25 times the default, also for the steps of their smooth
 # profiles, half of which each gain a ten-thousandth of chi2 in large blends of that field.
 ROUGH_TOL = 25 * Settings.loss_tol
