@@ -70,7 +70,8 @@ class Settings(FitSettings):
         as much over 10 iterations, since only fine structure is left.
         The limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
         iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
-        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
+        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`).
+        Above 0.25 the steps of the start's smooth profiles end earlier in proportion
     fit_shifts: fit a constant shift of each observation but the first. "auto" = only if light of
         isolated sources differs in position by over 0.25 model pixels and 3 sigma between two
         observations (inspection/shifted.py), starting from the measured shift

@@ -34,8 +34,9 @@ ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgErr
 # Iterations of the first fits of a cut blend's pieces. The next round replaces these fits and uses
 # only their light, which it subtracts with an assumed error of 15 % (MODEL_ERROR).
 ROUGH_ITERATIONS = 60
-# `Settings.loss_tol` of these fits: 25 times the default, also for the steps of their smooth
-# profiles, half of which each gain a ten-thousandth of chi2 in large blends of that field.
+# `Settings.loss_tol` of these fits, 25 times the default. Profiles of the two largest blends of
+# `simulate field --sky bright`, seed 1, then take 63 renderings in place of 111, to the same chi2
+# within 0.4 %.
 ROUGH_TOL = 25 * Settings.loss_tol
 # [px] Model pixels times sources above which a blend is large, and the largest number of iterations
 # of large blends. Large galaxies with clumps need up to a thousand, in which light moves between
