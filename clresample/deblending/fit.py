@@ -203,7 +203,8 @@ def start_fits(fits):
     began = time.perf_counter()
     for fit in fits:
         fit.forget_start()
-    points = fit_start_profiles([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    settings, patches = fits[0].settings, [fit.patch for fit in fits]
+    points = fit_start_profiles(patches, fit_sky=settings.fit_sky, tol=settings.start_tol)
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
         fit.begin(point, seconds)

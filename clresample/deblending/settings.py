@@ -10,6 +10,7 @@ from ..sky.validation.checks import check_instance, check_integer, check_number
 from .iterate import LbfgsRun
 from .solver.multiscale.engine import vector_bytes
 from .solver.multiscale.prior import MultiscalePrior
+from .start.profile_fit import CHI2_TOL
 
 AUTO = "auto"  # fit_shifts: by measurement
 
@@ -34,6 +35,11 @@ class FitSettings:
         check_instance("fit_sky", self.fit_sky, (bool, np.bool_))
         if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
             raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
+
+    @property
+    def start_tol(self) -> float:
+        """Gain in chi2 below which steps of the smooth profiles at the start end."""
+        return CHI2_TOL
 
     def start_run(self, fits, device, dtype, takes_over=None):
         """The run of Fits of one signature that have begun, as `iterate` drives it.
@@ -64,7 +70,8 @@ class Settings(FitSettings):
         as much over 10 iterations, since only fine structure is left.
         The limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
         iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
-        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
+        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`).
+        Above 0.25 the steps of the start's smooth profiles end earlier in proportion
     fit_shifts: fit a constant shift of each observation but the first. "auto" = only if light of
         isolated sources differs in position by over 0.25 model pixels and 3 sigma between two
         observations (inspection/shifted.py), starting from the measured shift
@@ -107,6 +114,11 @@ class Settings(FitSettings):
         check_fraction("flux_error_floor", self.flux_error_floor)
         check_instance("errors", self.errors, (bool, np.bool_))
         check_instance("prior", self.prior, MultiscalePrior)
+
+    @property
+    def start_tol(self) -> float:
+        """See `FitSettings.start_tol`; larger where `loss_tol` is larger than the default."""
+        return max(CHI2_TOL, CHI2_TOL * self.loss_tol / Settings.loss_tol)
 
     def start_run(self, fits, device, dtype, takes_over=None) -> LbfgsRun:
         """See `FitSettings.start_run`."""

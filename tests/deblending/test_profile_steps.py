@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from clresample.deblending.linear.linearised_scenes import LinearisedScenes
+from clresample.deblending.settings import Settings
 from clresample.deblending.start import profile_fit
 from clresample.deblending.start.population import OWN_LIGHT
 from clresample.deblending.start.profile_fit import ProfileFit
+from clresample.paper.settings import PaperSettings
 
 
 class Valley:
@@ -84,6 +86,19 @@ def test_steps_end_where_the_next_one_gains_less_than_asked(valley):
     fit._step(np.arange(2), tol=30.0)
     assert (looking.n_looks - before).tolist() == [1, 0]  # chi2 of 21 and of 25 is left
     assert 101 < fit.chi2[0] < 130 and fit.chi2[1] == pytest.approx(125)
+
+
+def test_a_start_ends_by_its_own_tolerance(valley):
+    fit, looking = valley([0.5, 0.05])
+    fit.tol, before = 30.0, looking.n_looks.copy()
+    fit.run()
+    assert (looking.n_looks - before)[0] < 3 and fit.chi2[1] == pytest.approx(125)
+
+
+@pytest.mark.parametrize(("loss_tol", "tol"), [(0.25, 1.0), (0.025, 1.0), (6.25, 25.0)])
+def test_rougher_fits_have_rougher_starts(loss_tol, tol):
+    assert Settings(loss_tol=loss_tol).start_tol == tol
+    assert PaperSettings().start_tol == 1.0
 
 
 def test_profiles_step_to_the_bottom_and_stop_there(valley):

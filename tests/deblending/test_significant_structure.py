@@ -69,6 +69,14 @@ def test_scenes_that_still_fall_far_look_after_eighty_rounds():
     assert progress.significance_due(np.ones(4, bool)).tolist() == [False, True, False, False]
 
 
+def test_scenes_that_are_not_described_look_as_soon_as_they_have_settled():
+    """Whatever they gain: weak strengths, which count no misfit, would keep it."""
+    progress = begun(1.51 * N_PIXELS, 1.49 * N_PIXELS, 1.51 * N_PIXELS)
+    progress.settled[:2] = True
+    falls(progress, 10.0, 10.0, 10.0)
+    assert progress.significance_due(np.ones(3, bool)).tolist() == [True, False, False]
+
+
 def test_no_fit_converges_before_it_has_looked():
     """Of a larger `loss_tol` than what looking needs."""
     progress = begun(100, 100)

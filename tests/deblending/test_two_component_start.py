@@ -185,12 +185,16 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
         return SimpleNamespace(significant=np.array(which, int))
 
     asked = [None, clear(1), clear(), clear(0, 2)]
-    settings = SimpleNamespace(fit_sky=True)
+    settings, tols = SimpleNamespace(fit_sky=True, start_tol=25.0), []
     fits = [SimpleNamespace(name=i, start=[i] * 3, settings=settings) for i in range(4)]
     monkeypatch.setattr(second, "run_gradient_tests", lambda fits: asked)
     monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
     monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
-    monkeypatch.setattr(second, "fit_start_profiles", lambda patches, fit_sky=False: patches)
+    monkeypatch.setattr(
+        second,
+        "fit_start_profiles",
+        lambda patches, fit_sky=False, *, tol: tols.append(tol) or patches,
+    )
     monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin[0]}")
     monkeypatch.setattr(second, "_as_before", lambda whole, begin, _: f"{whole} as {begin[0]}")
     monkeypatch.setattr(second, "_with_cores", lambda fit, one: f"cores {one.significant.tolist()}")
@@ -217,7 +221,7 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
         ],
     }
     asked[1] = asked[3] = None
-    assert second.start_refits(fits) == {}
+    assert second.start_refits(fits) == {} and tols == [25.0, 25.0]
 
 
 def test_the_other_start_takes_galaxies_over():

@@ -166,6 +166,7 @@ def test_a_large_piece_has_many_pixels_times_sources():
 def test_rough_and_large_fits_have_few_iterations(rough, large, continued, given, most, errors):
     settings = _settings(SimpleNamespace(settings=Settings(**given)), rough, large, continued)
     assert (settings.max_iter, settings.errors) == (most, errors)
+    assert settings.loss_tol == Settings.loss_tol * (25 if rough else 1)
     paper = PaperSettings()
     assert _settings(SimpleNamespace(settings=paper), rough, large, continued) is paper
 

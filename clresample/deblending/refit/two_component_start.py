@@ -44,10 +44,10 @@ def start_refits(fits):
     }
     if not asked:
         return {}
-    fit_sky = fits[0].settings.fit_sky
-    alone = fit_start_profiles([_alone(fits[i], one) for i, one in asked.items()])
+    fit_sky, tol = fits[0].settings.fit_sky, fits[0].settings.start_tol
+    alone = fit_start_profiles([_alone(fits[i], one) for i, one in asked.items()], tol=tol)
     patches = [_together(fits[i], one.significant) for i, one in asked.items()]
-    together = fit_start_profiles(patches, fit_sky=fit_sky)
+    together = fit_start_profiles(patches, fit_sky=fit_sky, tol=tol)
     starts = []
     for (i, one), own, all_smooth in zip(asked.items(), alone, together, strict=True):
         first = fits[i]

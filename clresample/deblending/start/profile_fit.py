@@ -38,7 +38,7 @@ MIN_GROWTH = 0.5 * np.log(GROWTH)
 class ProfileFit:
     """The least-squares problems of B scenes' parameters theta (B, n, 4), padded with zeros.
 
-    looking: LinearisedScenes; noise (B, C): of a model pixel
+    looking: LinearisedScenes; noise (B, C): of a model pixel; tol: least gain in chi2 of a step
 
     expected, population: PopulationPriors on the parameters, the first and the present one
     source (B, n): to which each component belongs, -1 where there is none
@@ -50,8 +50,8 @@ class ProfileFit:
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
     """
 
-    def __init__(self, looking: LinearisedScenes, noise):
-        self.looking, self.noise = looking, noise
+    def __init__(self, looking: LinearisedScenes, noise, tol=CHI2_TOL):
+        self.looking, self.noise, self.tol = looking, noise, tol
         shapes = [c.shape for c in looking.components]
         self.counts = np.array([len(shape.mean) for shape in shapes])
         self.at = looking.scene, looking.index
@@ -128,14 +128,14 @@ class ProfileFit:
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
-    def _step(self, scenes, n_steps=N_STEPS, tol=CHI2_TOL, *, learn=False):
-        """Step until some scenes have ended; tol: least gain in chi2, measured or expected.
+    def _step(self, scenes, n_steps=N_STEPS, tol=None, *, learn=False):
+        """Step until some scenes have ended; tol: least gain, measured or expected; None: self.tol.
 
         learn: update the prior after each step, of each scene until that takes back what the step
         gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
         of the doubt at the end.
         """
-        learning = np.full(len(self.theta), learn)
+        learning, tol = np.full(len(self.theta), learn), self.tol if tol is None else tol
         steps = StepControl(len(self.theta))
         live = np.isin(np.arange(len(self.theta)), scenes)
         for i_step in range(n_steps):

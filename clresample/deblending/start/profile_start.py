@@ -29,7 +29,7 @@ from ..linear.linearised_scenes import linearise
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..sampled_psf import sampled_psfs
 from ..view import WhitenedView, pixel_noise
-from .profile_fit import ProfileFit, start_from
+from .profile_fit import CHI2_TOL, ProfileFit, start_from
 from .star_weights import allow_for_psf_error
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
@@ -109,17 +109,19 @@ class StartingPoint:
         return self.shapes[i].bounding_box(self.thetas[i], self.drawn_positions[i], threshold)
 
 
-def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[StartingPoint]:
+def fit_start_profiles(
+    patches: list[StartInput], *, fit_sky=False, tol=CHI2_TOL
+) -> list[StartingPoint]:
     """Fits profiles and free stars of all patches side by side; see the module's text.
 
     patches: of equal numbers of observations, these of equal shapes
-    fit_sky: also a level per channel
+    fit_sky: also a level per channel; tol: see ProfileFit
     """
     sources, components = _components(patches)
     views = [p.views for p in patches]
     looking = linearise(views, components, PRECISION, TOLERANCE, fit_sky=fit_sky)
     noise = np.array([pixel_noise(p.views) for p in patches])
-    fit = ProfileFit(looking, noise)
+    fit = ProfileFit(looking, noise, tol)
     fit.begin()
     dark = _dark(patches, sources, looking)
     start_from(fit, _known(patches, components))
