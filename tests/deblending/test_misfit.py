@@ -67,12 +67,21 @@ def test_a_faint_source_whose_chi2_is_all_but_of_noise_is_flagged():
     assert flagged(found) == [True, False] and not summary(found)["good"]
 
 
-def test_a_bright_galaxy_that_is_half_a_percent_off_is_not_wrong():
+def test_a_bright_galaxy_that_is_half_a_percent_off_is_no_misfit_of_a_fit_that_is_one():
+    """Its flux is all but right, and chi2 is not that of noise."""
     found = with_misfit_status(broken(times=(1.005, 1), bright=3000.0))
     table = catalogue(found)
     assert table["misfit_sigma"][0] > 20
     assert table["misfit_fraction"][0] == pytest.approx(0.005, rel=0.3)
-    assert not any(flagged(found)) and found.status == "converged" and summary(found)["good"]
+    assert found.status == "misfit" and not summary(found)["good"]
+    assert not any(flagged(found)) and "leaves 0.5 % of its flux" in found.messages[0]
+
+
+@pytest.mark.parametrize("times, status", [(1.0004, "converged"), (1.002, "misfit")])
+def test_fits_converge_at_chi2_of_noise_alone(times, status):
+    """chi2 of the galaxies' pixels is 1.0 and 1.5, though both leave 0.2 % of a flux at most."""
+    found = with_misfit_status(broken(times=(times, 1), bright=3000.0))
+    assert found.status == status and not found.misfit.sources().any()
 
 
 def test_light_that_is_left_is_compared_with_the_light_beside_a_masked_core():
