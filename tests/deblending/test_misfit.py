@@ -9,6 +9,7 @@ from helpers.blends import blend, gaussian, observe, round_component
 
 from clresample import Flag, Grid, PointSource, catalogue, deblend, fluxes, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
+from clresample.deblending.assessment.psf_width import width_errors
 from clresample.deblending.assessment.status import with_misfit_status
 from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, _kernels, fine_scatter
 from clresample.sky.observation import masked
@@ -194,3 +195,17 @@ def test_a_sharp_oversampled_psf_gives_a_kernel_without_a_warning():
     assert kernel.sum() == pytest.approx(1)
     variance = (kernel.sum(axis=0) * (np.arange(41) - 20) ** 2).sum()
     assert np.sqrt(variance) == pytest.approx(0.66, abs=0.1)  # with the pixel
+
+
+@pytest.mark.parametrize("left, part", [(4.9, 0), (7.5, 0.5), (40.0, 1)])
+def test_fluxes_are_uncertain_by_the_psf_s_width_where_light_is_left(left, part):
+    """Of two Gaussians, whose flux changes by the ratio of the PSF's variance to their own."""
+    result = broken()
+    residuals = np.array([[0.0, left], [0.0, 0.0]])
+    known = replace(result.misfit, residuals=residuals, excess=np.zeros((2, 2)))
+    vars(result)["misfit"] = known  # a cached property
+    found = width_errors(result, 0.03)
+    light = [c.spectrum * c.morphology.sum() for c in result.components]
+    variance = (result.observations[0].psf.fwhm_px / np.sqrt(8 * np.log(2))) ** 2
+    wanted = 0.03 * part * light[0] * variance / 2.5**2
+    np.testing.assert_allclose(found, [wanted, np.zeros(2)], rtol=0.05)

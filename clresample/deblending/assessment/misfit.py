@@ -54,16 +54,20 @@ class Misfit:
     wide_sigma: np.ndarray
     wide_part: np.ndarray
 
+    def own_sigma(self) -> np.ndarray:
+        """The larger one of residuals and excess (S, C) [sigma], 0 or more."""
+        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess)).clip(0)
+
     def sigma(self) -> np.ndarray:
-        """The largest one of residuals, excess and wide_sigma (S, C) [sigma], 0 or more."""
-        return np.maximum(self._own_sigma, self.wide_sigma[:, None])
+        """The largest one of `own_sigma` and wide_sigma (S, C) [sigma]."""
+        return np.maximum(self.own_sigma(), self.wide_sigma[:, None])
 
     def fraction(self) -> np.ndarray:
         """Residual light over flux (S,), in the channel where it is largest.
 
         0 where no channel has over 5 sigma, and no light around a point has over WIDE_SIGMAS.
         """
-        part = np.where(self._own_sigma > MISFIT_SIGMAS, self.light / self.flux, 0.0)
+        part = np.where(self.own_sigma() > MISFIT_SIGMAS, self.light / self.flux, 0.0)
         wide = np.where(self.wide_sigma > WIDE_SIGMAS, self.wide_part, 0.0)
         return np.maximum(part.max(axis=1, initial=0.0), wide)
 
@@ -84,10 +88,6 @@ class Misfit:
     def is_wrong_on_sources(self) -> bool:
         """`is_wrong` for the pixels of the sources alone."""
         return bool((self.whole_excess[0] > MISFIT_SIGMAS).any())
-
-    @property
-    def _own_sigma(self):
-        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
 
 
 def misfit_of(result) -> Misfit:
