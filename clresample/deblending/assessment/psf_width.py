@@ -32,8 +32,7 @@ def width_errors(result, psf_error) -> np.ndarray:
             if not weight[c.source]:
                 continue
             image = image_within(result.rendered[i], k, window_of(result.rendered[i], k))
-            slopes = (np.gradient(image, axis=axis) for axis in (1, 2))
-            steep = sum((slope**2).sum(axis=(1, 2)) for slope in slopes)
+            steep = sum((np.diff(image, axis=axis) ** 2).sum(axis=(1, 2)) for axis in (1, 2))
             power = np.maximum((image**2).sum(axis=(1, 2)), 1e-300)
             flux = np.abs(c.spectrum[channels]) * c.morphology.sum()
             change = np.minimum(variance * steep / power, 1.0)
