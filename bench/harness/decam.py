@@ -189,8 +189,7 @@ def _both_of_dev(row, table, to_ujy):
     The Tractor lists two sources where the image has three, 15 px apart: its DEV of 6.4 arcsec is a
     model of two of them (chi2 6030 for 4580 pixels; three of GalSim's Sersic profiles have 4568),
     and 29 % of its flux lies beyond the pixels that it was fitted to. In a fit of all three, n = 4
-    of the large one has a chi2 higher by 57 than n = 1 (48 with a free sky). The fluxes are 105, 55,
-    33 uJy with n = 1.
+    of the large one has a chi2 higher by 57 than n = 1 (48 with a free sky).
     """
     dev = table[[true["type"].strip() == "DEV" for true in table]][0]
     away = [

@@ -77,7 +77,7 @@ class Misfit:
 
     def significant(self) -> np.ndarray:
         """Selects sources (S,) with a `sigma` over MISFIT_SIGMAS, however small its `fraction`."""
-        return (self.sigma() > MISFIT_SIGMAS).any(axis=1)
+        return self.sigma().max(axis=1, initial=0.0) > MISFIT_SIGMAS
 
     @property
     def is_wrong(self) -> bool:
