@@ -217,7 +217,8 @@ def with_errors(fit, result, peaks, seen):
     )
     fit.note_seconds("errors", time.perf_counter() - began)
     psf_error = fit.settings.psf_error
-    by_psf = np.hypot(core_errors(result, psf_error), width_errors(result, psf_error))
+    widths = width_errors(result, psf_error)
+    by_psf = np.hypot(core_errors(result, psf_error), widths)
     # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
     # within their errors, by both together 70 % (bench.ladder, single).
     shapes = missed_light(result)
@@ -229,7 +230,10 @@ def with_errors(fit, result, peaks, seen):
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
-    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged)
+    s, c = np.nonzero(widths)  # independent of one another
+    by_width = np.zeros((*widths.shape, len(s)))
+    by_width[s, c, np.arange(len(s))] = widths[s, c]
+    changes = flux_changes(np.concatenate([doubts, changes, by_width], axis=2), exchanged)
     draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
 
