@@ -18,7 +18,8 @@ named       whether a warning, message or flag names the cause, that the unspoil
 good        named, or nothing moved by more than 3 errors of the unspoilt fit
 
 Texts that the spoilt fit adds are printed below its row. At last clean simulated scenes are fitted:
-a false warning is any text about them or the unspoilt scenes but that a source is under the noise.
+a false warning is any text about them or the unspoilt scenes but that a source is under the noise,
+that two sources are closer than a pixel where they are, and those of `spoilt_scenes.TRUE_OF`.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ FIRST_CLEAN = 30000
 NAMES = dict.fromkeys((*spoiling.SPOILT, *spoiling.SAMPLED))
 ENOUGH_SIGMA = 3.0
 UNDER_NOISE = "far from any light"  # of messages about sources that no image shows
+DOUBLES = "of each other: no image tells their fluxes apart"  # of messages about close sources
 COLUMNS = records.columns(
     "scene:10 spoilt:21 moved:7.1f ratio:6.2f own:6.1f neighbour:9.1f n_ratio:7.2f n_own:6.1f "
     "chi2:7.2f status:15 flags:26 named:5 good:5"
@@ -151,8 +153,15 @@ def row_of(name, spoilt, fit, reference, brightest):
     }
 
 
+def false_texts(texts, name, scene):
+    """The texts about a scene, spoilt by nothing, that are not true of it."""
+    true = [spoilt_scenes.TRUE_OF[name]] if name in spoilt_scenes.TRUE_OF else []
+    true += [DOUBLES] if spoilt_scenes.has_doubles(scene) else []
+    return [text for text in texts if not any(words in text for words in true)]
+
+
 def measure(name, data, ways):
-    """Rows of a scene, spoilt in each of some ways, and what is said of it as it is."""
+    """Rows of a scene, spoilt in each of some ways, and false texts about it as it is."""
     scene = make_scene(name, data)
     if scene is None:
         return None
@@ -167,17 +176,17 @@ def measure(name, data, ways):
         change = (spoiling.SPOILT | spoiling.SAMPLED)[way][0]
         fit = Fitted(lambda change=change: change(scene, brightest), n)
         rows.append(row_of(name, way, fit, reference, brightest))
-    return rows, reference.texts
+    return rows, false_texts(reference.texts, name, scene)
 
 
 def measure_clean(i):
-    """Messages about the clean simulated scene of a seed."""
+    """False texts about the clean simulated scene of a seed."""
     scene = spoilt_scenes.simulated(i)
-    return Fitted(lambda: scene, len(scene.places)).texts
+    return false_texts(Fitted(lambda: scene, len(scene.places)).texts, "sim", scene)
 
 
 def summarise(rows, clean):
-    """Number of good rows, and messages about unspoilt scenes; clean: {name: texts}."""
+    """Number of good rows, and false texts about unspoilt scenes; clean: {name: texts}."""
     bad = [f"{row['scene']}, {row['spoilt']}" for row in rows if not row["good"]]
     said = {}
     for texts in clean.values():

@@ -251,9 +251,10 @@ class Result(ResultDisplay):
         They are the fluxes of `sample`, corrected for light beyond the boxes and for the bound at 0
         like those of `fluxes`, so that they scatter about the catalogue's; NaN if not measured.
         They also scatter by what is open of the division of light between neighbours
-        (posterior/shared_light.py) and of size and wings of faint galaxies (start/shape_grid.py),
-        which can make fluxes negative. Errors of the catalogue are larger where they include light
-        outside the images, a saturated core, or the light of a saturated star beside them.
+        (posterior/shared_light.py), of size and wings of faint galaxies (start/shape_grid.py), and
+        of the PSF's width (assessment/psf_width.py), which can make fluxes negative. Errors of the
+        catalogue are larger where they include light outside the images, a saturated core, or the
+        light of a saturated star beside them.
 
         rng: NumPy Generator, or a seed
 

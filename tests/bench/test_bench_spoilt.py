@@ -1,5 +1,7 @@
 """The benchmark of spoilt input: rows, ways of spoiling, words that name them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.benches import bench_json
@@ -104,3 +106,17 @@ def test_ways_of_spoiling_do_what_they_say():
         scene.observations[0].data * scene.observations[0].weights ** 0.5,
         rtol=1e-5,
     )
+
+
+@pytest.mark.parametrize(("apart_px", "said"), [(0.9, False), (1.1, True)])
+def test_a_warning_of_two_close_sources_is_false_where_they_are_apart(apart_px, said):
+    from bench.harness.spoilt_scenes import simulated
+    from bench.spoilt import DOUBLES, false_texts
+
+    scene = simulated(3, 1)
+    grid = scene.observations[-1].grid
+    y, x = grid.pixel(*scene.places[0])
+    scene = replace(scene, places=np.array([scene.places[0], grid.sky(y, x + apart_px)]))
+    texts = [f"sources 0 and 1 lie within 1 pixel {DOUBLES}", "sky is left in"]
+    assert false_texts(texts, "sim", scene) == texts[1 - said :]
+    assert false_texts(["light that no source is listed for"], "hsc_blend", scene) == []

@@ -9,6 +9,7 @@ from helpers.blends import blend, gaussian, observe, round_component
 
 from clresample import Flag, Grid, PointSource, catalogue, deblend, fluxes, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
+from clresample.deblending.assessment.psf_width import width_errors
 from clresample.deblending.assessment.status import with_misfit_status
 from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, _kernels, fine_scatter
 from clresample.sky.observation import masked
@@ -67,12 +68,21 @@ def test_a_faint_source_whose_chi2_is_all_but_of_noise_is_flagged():
     assert flagged(found) == [True, False] and not summary(found)["good"]
 
 
-def test_a_bright_galaxy_that_is_half_a_percent_off_is_not_wrong():
+def test_a_bright_galaxy_that_is_half_a_percent_off_is_no_misfit_of_a_fit_that_is_one():
+    """Its flux is all but right, and chi2 is not that of noise."""
     found = with_misfit_status(broken(times=(1.005, 1), bright=3000.0))
     table = catalogue(found)
     assert table["misfit_sigma"][0] > 20
     assert table["misfit_fraction"][0] == pytest.approx(0.005, rel=0.3)
-    assert not any(flagged(found)) and found.status == "converged" and summary(found)["good"]
+    assert found.status == "misfit" and not summary(found)["good"]
+    assert not any(flagged(found)) and "leaves 0.5 % of its flux" in found.messages[0]
+
+
+@pytest.mark.parametrize("times, status", [(1.0004, "converged"), (1.002, "misfit")])
+def test_fits_converge_at_chi2_of_noise_alone(times, status):
+    """chi2 of the galaxies' pixels is 1.0 and 1.5, though both leave 0.2 % of a flux at most."""
+    found = with_misfit_status(broken(times=(times, 1), bright=3000.0))
+    assert found.status == status and not found.misfit.sources().any()
 
 
 def test_light_that_is_left_is_compared_with_the_light_beside_a_masked_core():
@@ -185,3 +195,17 @@ def test_a_sharp_oversampled_psf_gives_a_kernel_without_a_warning():
     assert kernel.sum() == pytest.approx(1)
     variance = (kernel.sum(axis=0) * (np.arange(41) - 20) ** 2).sum()
     assert np.sqrt(variance) == pytest.approx(0.66, abs=0.1)  # with the pixel
+
+
+@pytest.mark.parametrize("left, part", [(4.9, 0), (7.5, 0.5), (40.0, 1)])
+def test_fluxes_are_uncertain_by_the_psf_s_width_where_light_is_left(left, part):
+    """Of two Gaussians, whose flux changes by the ratio of the PSF's variance to their own."""
+    result = broken()
+    residuals = np.array([[0.0, left], [0.0, 0.0]])
+    known = replace(result.misfit, residuals=residuals, excess=np.zeros((2, 2)))
+    vars(result)["misfit"] = known  # a cached property
+    found = width_errors(result, 0.03)
+    light = [c.spectrum * c.morphology.sum() for c in result.components]
+    variance = (result.observations[0].psf.fwhm_px / np.sqrt(8 * np.log(2))) ** 2
+    wanted = 0.03 * part * light[0] * variance / 2.5**2
+    np.testing.assert_allclose(found, [wanted, np.zeros(2)], rtol=0.05)

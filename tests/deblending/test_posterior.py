@@ -131,7 +131,8 @@ def test_draws_of_misfitted_sources_scatter_as_the_catalogue_says(fitted, device
     data[0, 15, 14] -= 1.25
     data[0, 19, 24] += 2.0
     hit = Observation(data, sharp.psf, sharp.grid, weights=sharp.weights, channels=("v",))
-    result = deblend([hit, other], b.sources, frame=b.frame, device=device, settings=BARE)
+    exact = replace(BARE, psf_error=0)  # draws of morphologies hold no error of the PSF
+    result = deblend([hit, other], b.sources, frame=b.frame, device=device, settings=exact)
     found = {}
     for name, one in (("well fitted", fitted), ("misfitted", result)):
         table = catalogue(one)
@@ -144,6 +145,10 @@ def test_draws_of_misfitted_sources_scatter_as_the_catalogue_says(fitted, device
             assert (table[column] > 9).all() == (name == "misfitted")
     np.testing.assert_allclose(found["misfitted"], found["well fitted"], rtol=0.2)
     assert (found["misfitted"] > 0.7).all() and (found["misfitted"] < 1.1).all()
+    wide = deblend([hit, other], b.sources, frame=b.frame, device=device, settings=BARE)
+    drawn = wide.sample_fluxes(500, np.random.default_rng(0)).std(axis=0)
+    np.testing.assert_allclose(drawn / errors(wide), 1, atol=0.2)
+    assert (errors(wide) / errors(result)).max() > 1.5  # by the PSF's width
 
 
 def test_errors_hold_the_truth(device):

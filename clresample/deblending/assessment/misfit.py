@@ -16,14 +16,6 @@ from .extended import WIDE_SIGMAS, extended_light
 # (Settings.flux_error_floor, structure, and their growth with the residual). Simulated galaxies
 # with good fits have fluxes within 3 %.
 MISFIT_FRACTION = 0.03
-# Residual fraction of the flux of all sources of a blend from which its model is wrong. The
-# residual of a single source sets only its flag.
-WRONG_FRACTION = 0.1
-# chi2 per pixel, relative to that of the noise, from which it is significant: a local error of 15 %
-# in the weights' sigma has the same effect.
-WRONG_CHI2 = 1.3
-# chi2 per pixel of a channel, relative to that of the noise, that is significant in any case.
-WRONG_ANYWAY = 2.0
 # chi2 per pixel, relative to that of the noise, up to which it does not count as misfit: the local
 # accuracy of weights.
 TRUSTED_CHI2 = 1.1
@@ -47,8 +39,8 @@ class Misfit:
         contribution of noise; if a residual is over 5 sigma, at least the flux of that point source
     flux (S, C) [counts]: of the model on pixels with a weight, since that of a saturated star's
         core says nothing of its fit; at least the flux error at fixed morphology
-    whole_excess, whole_chi2, whole_light (2, C): the same for the pixels of all sources together,
-        and of all pixels of the channel on the frame
+    whole_excess, whole_chi2 (2, C): the same for the pixels of all sources together, and of all
+        pixels of the channel on the frame
     wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
     """
 
@@ -59,20 +51,23 @@ class Misfit:
     flux: np.ndarray
     whole_excess: np.ndarray
     whole_chi2: np.ndarray
-    whole_light: np.ndarray
     wide_sigma: np.ndarray
     wide_part: np.ndarray
 
+    def own_sigma(self) -> np.ndarray:
+        """The larger one of residuals and excess (S, C) [sigma], 0 or more."""
+        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess)).clip(0)
+
     def sigma(self) -> np.ndarray:
-        """The largest one of residuals, excess and wide_sigma (S, C) [sigma], 0 or more."""
-        return np.maximum(self._own_sigma, self.wide_sigma[:, None])
+        """The largest one of `own_sigma` and wide_sigma (S, C) [sigma]."""
+        return np.maximum(self.own_sigma(), self.wide_sigma[:, None])
 
     def fraction(self) -> np.ndarray:
         """Residual light over flux (S,), in the channel where it is largest.
 
         0 where no channel has over 5 sigma, and no light around a point has over WIDE_SIGMAS.
         """
-        part = np.where(self._own_sigma > MISFIT_SIGMAS, self.light / self.flux, 0.0)
+        part = np.where(self.own_sigma() > MISFIT_SIGMAS, self.light / self.flux, 0.0)
         wide = np.where(self.wide_sigma > WIDE_SIGMAS, self.wide_part, 0.0)
         return np.maximum(part.max(axis=1, initial=0.0), wide)
 
@@ -80,33 +75,19 @@ class Misfit:
         """Selects misfitted sources (S,): those with a `fraction` over MISFIT_FRACTION."""
         return self.fraction() > MISFIT_FRACTION
 
+    def significant(self) -> np.ndarray:
+        """Selects sources (S,) with a `sigma` over MISFIT_SIGMAS, however small its `fraction`."""
+        return self.sigma().max(axis=1, initial=0.0) > MISFIT_SIGMAS
+
     @property
     def is_wrong(self) -> bool:
-        """True if the model as a whole does not describe the data.
-
-        chi2 of a channel is significant, at the sources or on the frame, and the residual fraction
-        of the light is large, or chi2 of the frame is.
-        """
-        beyond = self.whole_chi2[1] > WRONG_ANYWAY
-        return bool((self._wrong | [np.zeros_like(beyond), beyond & self._significant[1]]).any())
+        """True if chi2 of a channel is not that of noise, at the sources or on the frame."""
+        return self.is_wrong_on_sources or bool((self.whole_excess[1] > MISFIT_SIGMAS).any())
 
     @property
     def is_wrong_on_sources(self) -> bool:
         """`is_wrong` for the pixels of the sources alone."""
-        return bool(self._wrong[0].any())
-
-    @property
-    def _own_sigma(self):
-        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
-
-    @property
-    def _significant(self):
-        return self.whole_excess > MISFIT_SIGMAS
-
-    @property
-    def _wrong(self):
-        much = self.whole_light > WRONG_FRACTION * self.flux.sum(axis=0)
-        return (self.whole_chi2 > WRONG_CHI2) & much & self._significant
+        return bool((self.whole_excess[0] > MISFIT_SIGMAS).any())
 
 
 def misfit_of(result) -> Misfit:
@@ -119,7 +100,7 @@ def misfit_of(result) -> Misfit:
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
     fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own)]
     fields += [_observed_flux(result, remainders)]
-    fields += [*(rows[-2:] for rows in own), *extended_light(result, remainders)]
+    fields += [*(rows[-2:] for rows in own[:2]), *extended_light(result, remainders)]
     return Misfit(*fields)
 
 

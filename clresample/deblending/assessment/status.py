@@ -24,12 +24,14 @@ def with_misfit_status(result):
 def misfitted_sources(result) -> np.ndarray:
     """Selects sources (S,) flagged as misfits, by their residual light (`Misfit.sources`).
 
-    If a result has the status "misfit" and no such source, all fitted sources are selected.
+    If a result has the status "misfit" and no source has a significant residual, all fitted sources
+    are selected.
     """
     fitted = np.zeros(len(result.sources), bool)
     fitted[[c.source for c in result.components]] = True
-    found = result.misfit.sources() & fitted
-    return fitted if result.status == Ended.MISFIT and not found.any() else found
+    if result.status == Ended.MISFIT and not (result.misfit.significant() & fitted).any():
+        return fitted
+    return result.misfit.sources() & fitted
 
 
 def with_source_misfit_status(result):

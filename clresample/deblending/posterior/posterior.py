@@ -11,6 +11,7 @@ import numpy as np
 from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.extended import missed_light
+from ..assessment.psf_width import width_errors
 from ..assessment.status import with_misfit_status
 from ..component_images import local_chi2
 from ..linear.aligned_observation import align_observations
@@ -215,19 +216,24 @@ def with_errors(fit, result, peaks, seen):
         result, start.shapes, start.thetas, start.positions[start.source], peaks
     )
     fit.note_seconds("errors", time.perf_counter() - began)
-    cores = core_errors(result, fit.settings.psf_error)
+    psf_error = fit.settings.psf_error
+    widths = width_errors(result, psf_error)
+    by_psf = np.hypot(core_errors(result, psf_error), widths)
     # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
     # within their errors, by both together 70 % (bench.ladder, single).
     shapes = missed_light(result)
     shapes[fit.fitted] = np.hypot(shapes[fit.fitted], start.flux_scatter * fit.unit)
-    errors = with_core_errors(widened(with_common_error(errors, shapes), outside), cores)
+    errors = with_core_errors(widened(with_common_error(errors, shapes), outside), by_psf)
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
     exchanged = exchanged_light(result, posterior.solution, doubted)
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
-    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged)
+    s, c = np.nonzero(widths)  # independent of one another
+    by_width = np.zeros((*widths.shape, len(s)))
+    by_width[s, c, np.arange(len(s))] = widths[s, c]
+    changes = flux_changes(np.concatenate([doubts, changes, by_width], axis=2), exchanged)
     draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
 
