@@ -192,6 +192,7 @@ class Fit:
             status=self.status,
             thetas=_by_source(self, self.start.thetas),
             structures=_structures(self),
+            psf_error=self.settings.psf_error,
             messages=tuple(self.messages),
             seconds=self.seconds,
         )

@@ -68,6 +68,7 @@ class Result(ResultDisplay):
         above
     draws: PosteriorSampler of `sample` and `sample_fluxes`
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
+    psf_error [1]: of the fit's Settings; chi2 of `misfit` counts it as noise in the light of stars
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
     status: an Ended, which compares as its text: "converged", "misfit" (its steps ended, but the
         model does not describe the data, see `Misfit.is_wrong`), "iteration limit", "diverged" or
@@ -95,6 +96,7 @@ class Result(ResultDisplay):
     draws: PosteriorSampler | None = None
     thetas: tuple = ()
     structures: tuple = ()
+    psf_error: float = 0.0
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 

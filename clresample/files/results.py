@@ -179,6 +179,7 @@ def read_result(path) -> Result:
             status=Ended(about["status"]),
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
+            psf_error=about.get("psf_error", 0.0),
             errors=_errors(hdus),
             draws=read_draws(hdus, [(row["n_y"], row["n_x"]) for row in hdus["COMPONENTS"].data]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
@@ -191,6 +192,7 @@ def _about(result):
         "status": result.status,
         "messages": result.messages,
         "seconds": result.seconds,
+        "psf_error": result.psf_error,
         "sources": [
             # without ExtendedSource.profile, which only starts a fit
             {"kind": type(s).__name__}

@@ -7,7 +7,7 @@ import pytest
 from helpers import scenes
 from helpers.blends import blend, gaussian, observe, round_component
 
-from clresample import Flag, Grid, PointSource, catalogue, deblend, fluxes, summary
+from clresample import Flag, Grid, Observation, PointSource, catalogue, deblend, fluxes, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.psf_width import width_errors
 from clresample.deblending.assessment.status import with_misfit_status
@@ -188,6 +188,18 @@ def test_errors_of_a_faint_point_hold_the_light_around_it(sigma_px, kind):
         assert (np.abs(flux - (20, 14, 18)) < 2 * error).all() and (error > 2 * flux).all()
 
 
+@pytest.mark.parametrize("off, status", [(1.02, "converged"), (1.2, "misfit")])
+def test_the_error_of_a_stars_psf_is_no_misfit(off, status):
+    """A bright star whose PSF is passed too narrow: by less than psf_error, and by much more."""
+    seen = PSF.gaussian(3.0 * off).images[0]
+    half, data = seen.shape[0] // 2, np.random.default_rng(0).normal(0, 1, (1, *GRID.shape))
+    data[0, 40 - half : 41 + half, 42 - half : 43 + half] += 3e5 * seen
+    star = [PointSource(position_px=(40, 42))]
+    found = deblend([Observation(data, PSF.gaussian(3.0), GRID, weights=1.0)], star)
+    assert found.status == status
+    assert replace(found, psf_error=0.0).misfit.is_wrong
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_sharp_oversampled_psf_gives_a_kernel_without_a_warning():
     """As wide as the PSF on the observation's pixels, on which such a PSF could not be given."""
@@ -200,11 +212,11 @@ def test_a_sharp_oversampled_psf_gives_a_kernel_without_a_warning():
 @pytest.mark.parametrize("left, part", [(4.9, 0), (7.5, 0.5), (40.0, 1)])
 def test_fluxes_are_uncertain_by_the_psf_s_width_where_light_is_left(left, part):
     """Of two Gaussians, whose flux changes by the ratio of the PSF's variance to their own."""
-    result = broken()
+    result = replace(broken(), psf_error=0.03)
     residuals = np.array([[0.0, left], [0.0, 0.0]])
     known = replace(result.misfit, residuals=residuals, excess=np.zeros((2, 2)))
     vars(result)["misfit"] = known  # a cached property
-    found = width_errors(result, 0.03)
+    found = width_errors(result)
     light = [c.spectrum * c.morphology.sum() for c in result.components]
     variance = (result.observations[0].psf.fwhm_px / np.sqrt(8 * np.log(2))) ** 2
     wanted = 0.03 * part * light[0] * variance / 2.5**2

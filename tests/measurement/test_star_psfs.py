@@ -134,9 +134,10 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(s
         footprints=[SimpleNamespace(used=used)],
         observations=[SimpleNamespace(weights=weights)],
         sources=range(3),
+        psf_error=psf_error,
     )
     others = {s: _model(result, 0, np.flatnonzero(owner == s)) for s in {0, 1, 2} - {owner[star]}}
-    found = _neighbour_errors(result, 0, star, others, psf_error, place)
+    found = _neighbour_errors(result, 0, star, others, place)
     changes = [spectra[star][:, None, None] * rendered[star]]
     if place:
         y, x = np.indices((5, 6))

@@ -12,42 +12,76 @@ from ..inspection.star_psfs import StarPSFs
 from ..start.star_weights import MIN_PSF_ERROR_SIGMA
 
 
-def core_errors(result, psf_error) -> np.ndarray:
+def core_errors(result) -> np.ndarray:
     """Errors (S, C) [counts] of fluxes by the errors of stars' PSFs.
 
         psf_error |p - 2| flux,    p: power of the distance by which the light falls beside the core
 
     of saturated stars with a PSF of their own: if its width grows by the fraction epsilon, its
     light there grows by (p - 2) epsilon. Neighbours of all stars have those of `_neighbour_errors`.
-
-    psf_error [1]: see Settings
     """
     found = np.zeros((len(result.sources), len(result.channels)))
     owner = np.array([c.source for c in result.components], int)
-    stars = [k for k, s in enumerate(owner) if isinstance(result.sources[s], PointSource)]
-    if not stars:
+    if not any(isinstance(result.sources[s], PointSource) for s in owner):
         return found
-    positions = np.asarray(result.frame.positions_of(result.sources))
     for i, observation in enumerate(result.observations):
         field, channels = observation.psf_field, result.channel_slices()[i]
-        there = result.frame.grid.positions_in(observation.grid, *positions.T)
         models = {s: _model(result, i, np.flatnonzero(owner == s)) for s in np.unique(owner)}
-        for k in stars:
-            source, place = owner[k], there[owner[k]]
-            star = field.number_at(*place) if isinstance(field, StarPSFs) else None
+        for k, star, place in _stars(result, i):
+            source = owner[k]
             if star is not None:
                 component = result.components[k]
                 flux = np.abs(component.spectrum[channels]) * component.morphology.sum()
                 own = field.flux_error[star] * flux
                 found[source, channels] = np.hypot(found[source, channels], own)
-            # wings that were measured do not follow from the width of a core
-            is_measured = star is not None and not field.keeps_core[star]
             others = {s: model for s, model in models.items() if s != source}
-            errors = _neighbour_errors(
-                result, i, k, others, psf_error, None if is_measured else place
-            )
+            errors = _neighbour_errors(result, i, k, others, place)
             found[:, channels] = np.hypot(found[:, channels], errors)
-    return psf_error * found
+    return result.psf_error * found
+
+
+def star_variance(result, i) -> np.ndarray:
+    """Variance (Co, My, Mx) [counts^2] of an observation by the errors of its stars' PSFs.
+
+        psf_error^2 sum over stars of L^2 + (r . grad L)^2
+
+    as weights of the start have it: of light L at r from a star, see `_star_changes`.
+    """
+    found = np.zeros(result.footprints[i].used.shape)
+    if result.psf_error:
+        for k, _, place in _stars(result, i):
+            window, changes = _star_changes(result, i, k, place)
+            found[:, *window] += result.psf_error**2 * sum(change**2 for change in changes)
+    return found
+
+
+def _stars(result, i):
+    """Yields each star's component in observation i, its number in a StarPSFs or None, its place.
+
+    The place is None where wings were measured: they do not follow from the width of a core.
+    """
+    field, grid = result.observations[i].psf_field, result.observations[i].grid
+    for k, component in enumerate(result.components):
+        source = result.sources[component.source]
+        if isinstance(source, PointSource):
+            (place,) = result.frame.grid.positions_in(grid, *result.frame.positions_of([source]).T)
+            star = field.number_at(*place) if isinstance(field, StarPSFs) else None
+            is_measured = star is not None and not field.keeps_core[star]
+            yield k, star, None if is_measured else place
+
+
+def _star_changes(result, i, k, place):
+    """Window (slices y, x) of a star's light L, and its changes by errors of its PSF.
+
+    returns (window, [(Co, ny, nx) [counts], ...]): L itself, of a total that is off, and r . grad L
+        of a width that is, unless `place` is None
+    """
+    own = window_of(result.rendered[i], k, margin=1)
+    spectrum = np.abs(result.components[k].spectrum[result.channel_slices()[i]])
+    changes = [spectrum[:, None, None] * image_within(result.rendered[i], k, own)]
+    if place is not None:
+        changes.append(_widening(changes[0], [np.mgrid[own][a] - place[a] for a in (0, 1)]))
+    return own, changes
 
 
 def _model(result, i, parts):
@@ -66,7 +100,7 @@ def _model(result, i, parts):
     return window, model, flux
 
 
-def _neighbour_errors(result, i, k, models, psf_error, place):
+def _neighbour_errors(result, i, k, models, place):
     """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
 
         |sum_pixels w m (L, r . grad L)| / sum_pixels w m^2 flux
@@ -77,14 +111,10 @@ def _neighbour_errors(result, i, k, models, psf_error, place):
     models: {s: `_model`} of the other sources; place (2,) [px]: of the star, from which r is; None
         leaves the width out
     """
-    rendered, channels = result.rendered[i], result.channel_slices()[i]
     weights = np.where(result.footprints[i].used, result.observations[i].weights, 0.0)
-    own, out = window_of(rendered, k, margin=1), np.zeros((len(result.sources), len(weights)))
-    spectrum = np.abs(result.components[k].spectrum[channels])[:, None, None]
-    changes = [spectrum * image_within(rendered, k, own)]
-    if place is not None:
-        changes.append(_widening(changes[0], [np.mgrid[own][a] - place[a] for a in (0, 1)]))
-    lowered = 1 + weights[:, *own] * psf_error**2 * sum(change**2 for change in changes)
+    out = np.zeros((len(result.sources), len(weights)))
+    own, changes = _star_changes(result, i, k, place)
+    lowered = 1 + weights[:, *own] * result.psf_error**2 * sum(change**2 for change in changes)
     if not lowered.max(initial=1.0) > 1 + MIN_PSF_ERROR_SIGMA**2:
         return out
     weights[:, *own] /= lowered

@@ -9,6 +9,7 @@ import numpy as np
 from ...sky.noise import HALF_WIDTH
 from ..component_images import image_within, window_of
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
+from .cores import star_variance
 from .extended import WIDE_SIGMAS, extended_light
 
 # Fraction of a source's flux in a channel from which a significant residual is a misfit. Smaller
@@ -34,7 +35,8 @@ class Misfit:
 
     residuals (S, C) [sigma]: see `max_filtered_residuals`, NaN unseen
     excess (S, C) [sigma]: by how much chi2 of the source's pixels is over TRUSTED_CHI2
-    chi2 (S, C) [1]: per pixel there, over that of the noise; NaN without pixels
+    chi2 (S, C) [1]: per pixel there, over that of the noise and of the error of stars' PSFs; NaN
+        without pixels
     light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, minus the
         contribution of noise; if a residual is over 5 sigma, at least the flux of that point source
     flux (S, C) [counts]: of the model on pixels with a weight, since that of a saturated star's
@@ -94,9 +96,11 @@ def misfit_of(result) -> Misfit:
     """Compares a fitted blend with its data."""
     n_sources, worst, rest = len(result.sources), [], []
     remainders = [remainder(result, i) for i in range(len(result.observations))]
-    for left in remainders:
+    for i, left in enumerate(remainders):
         worst.append(left.worst(n_sources))
-        rest += [_of_channel(left, c, n_sources) for c in range(len(left.filtered))]
+        weights = result.observations[i].whitened.weights
+        noise = left.noise[:, None, None] + weights * star_variance(result, i)
+        rest += [_of_channel(left, c, n_sources, noise[c]) for c in range(len(left.filtered))]
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
     fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own)]
     fields += [_observed_flux(result, remainders)]
@@ -104,8 +108,11 @@ def misfit_of(result) -> Misfit:
     return Misfit(*fields)
 
 
-def _of_channel(rest, c, n_sources):
-    """excess, chi2, light (S + 2,) of a channel of a Remainder, the last two for the whole."""
+def _of_channel(rest, c, n_sources, noise):
+    """excess, chi2, light (S + 2,) of a channel of a Remainder, the last two for the whole.
+
+    noise (My, Mx): variance of its residual [sigma^2]
+    """
     used, owner = rest.used[c], rest.owner[c]
 
     def sums(where, values):
@@ -115,7 +122,7 @@ def _of_channel(rest, c, n_sources):
 
     count = sums(used, np.ones(used.shape))
     with np.errstate(invalid="ignore"):
-        chi2 = sums(used, rest.residual[c] ** 2 / rest.noise[c]) / count
+        chi2 = sums(used, rest.residual[c] ** 2 / noise) / count
     size = np.nan_to_num(np.abs(rest.filtered[c]))
     left = np.where(size > LEFT_SIGMAS, size, 0.0) - LEFT_BY_NOISE
     seen = used & np.isfinite(rest.filtered[c])

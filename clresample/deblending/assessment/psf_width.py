@@ -9,7 +9,7 @@ from ..inspection.image import SIGMAS_A_FWHM
 from ..posterior.residuals import MISFIT_SIGMAS
 
 
-def width_errors(result, psf_error) -> np.ndarray:
+def width_errors(result) -> np.ndarray:
     """Errors (S, C) [counts] of fluxes by an error of the PSF's width, independent by channel.
 
         psf_error w sigma^2 <|grad M|^2> / <M^2> flux,    w = min(1, max(0, m / 5 - 1))
@@ -18,12 +18,10 @@ def width_errors(result, psf_error) -> np.ndarray:
     the width grows by the fraction epsilon, M changes by epsilon sigma^2 laplace M, and the flux of
     an unchanged morphology by the ratio above, 1 for a point and small for large galaxies. Where
     nothing is left, the PSF is as good as the data, and errors have no such part.
-
-    psf_error [1]: see Settings
     """
     found = np.zeros((len(result.sources), len(result.channels)))
     left = result.misfit.own_sigma().max(axis=1, initial=0.0) / MISFIT_SIGMAS - 1
-    weight = psf_error * np.clip(left, 0.0, 1.0)
+    weight = result.psf_error * np.clip(left, 0.0, 1.0)
     for i, (o, channels) in enumerate(
         zip(result.observations, result.channel_slices(), strict=True)
     ):

@@ -216,9 +216,8 @@ def with_errors(fit, result, peaks, seen):
         result, start.shapes, start.thetas, start.positions[start.source], peaks
     )
     fit.note_seconds("errors", time.perf_counter() - began)
-    psf_error = fit.settings.psf_error
-    widths = width_errors(result, psf_error)
-    by_psf = np.hypot(core_errors(result, psf_error), widths)
+    widths = width_errors(result)
+    by_psf = np.hypot(core_errors(result), widths)
     # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
     # within their errors, by both together 70 % (bench.ladder, single).
     shapes = missed_light(result)
