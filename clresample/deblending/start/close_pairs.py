@@ -1,18 +1,22 @@
-"""A further start of close pairs of galaxies, of which one may have the light of both.
+"""Further starts of close pairs of galaxies, of which one may have the light of both.
 
 Two galaxies that grow from small profiles at nearly one place compete for the same light: one may
 grow to the size of both, while the other stays as small as it began. Chi2 has a minimum there, and
-often a deeper one where each has its own light. To reach it, scenes are fitted again from the
-larger one's profile at both places, without doubt of either shape, and the better fit stays. The
-other one, worse in chi2 by Delta, has the weight w of an alternative that profiles, which are wrong
-by more than noise, do not exclude. Errors of fluxes f hold the change to it (posterior.py):
+often a deeper one where each has its own light, or one where they have exchanged their light. To
+reach them, scenes are fitted again, without doubt of either shape, from the larger one's profile at
+both places: all of them together, and with the smaller one's profile held there. The best end
+stays. Profiles are wrong by more than noise, so that errors of the fluxes f hold the changes to the
+other ends, whose chi2 is worse by Delta (posterior.py):
 
-    w = 1 / (1 + exp(Delta / NEED)),    scatter = sqrt(w) (f_other - f)
+    scatter = sqrt(w) (f_other - f),    w = 1 / (1 + exp(Delta / NEED))
+
+Of 200 pairs of S/N 30 to 3000 at 0.5 to 2 px XXX.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import expit
 
 from ..profiles import GalaxyProfile, galaxy_reach
 from .first_profiles import NEED
@@ -21,26 +25,41 @@ from .shape_grid import part_inside
 # A close pair's largest distance, in units of the larger one's radius, and the least ratio of the
 # two radii, where profiles fall to a part of their peak.
 MAX_AWAY, MIN_RATIO, RADIUS_LEVEL = 0.5, 1.5, 0.1
+N_ENDS = 3  # before, of both profiles, with one of them held
 
 
 def run_from_equal_profiles(fit, scenes):
-    """Fits scenes (k,) of a ProfileFit again that hold close pairs; the better fits stay."""
+    """Fits scenes (k,) of a ProfileFit again that hold close pairs; the best ends stay."""
     larger = {i: j for b in scenes for i, j in _larger_neighbours(fit, b)}
     if not larger:
         return
-    at, thetas = np.array(fit.at), fit.thetas()
-    scenes = np.unique(at[0, list(larger)])
-    before, chi2, flux = fit._copy(), fit._chi2_as_expected(scenes), _fluxes(fit)
-    for i, j in larger.items():
-        fit.theta[*at[:, i]] = thetas[j]
-        fit.population.contamination[*at[:, [i, j]]] = 1
-    fit._take(scenes, doubt=False)
-    fit._step(scenes)
-    worse, change = fit._chi2_as_expected(scenes) - chi2, _fluxes(fit) - flux
-    fit._undo(before, scenes[~(worse < 0)])
-    weight = np.zeros(len(fit.chi2))
-    weight[scenes] = 1 / (1 + np.exp(np.abs(worse) / NEED))
-    fit.flux_doubt = np.sqrt(weight[at[0]])[:, None] * change
+    at, small, thetas = np.array(fit.at), list(larger), fit.thetas()
+    scenes, before = np.unique(at[0, small]), fit._copy()
+    ends = [(before, *_end(fit, scenes))]
+    for held in (False, True):
+        fit._restore(before, scenes)
+        for i, j in larger.items():
+            fit.theta[*at[:, i]] = thetas[j]
+            fit.population.contamination[*at[:, [i, j]]] = 1
+        fit.moves[*at[:, small]] = not held
+        fit._take(scenes, doubt=False)
+        fit._step(scenes)
+        ends.append((fit._copy(), *_end(fit, scenes)))
+    fit.moves[*at[:, small]] = True
+    copies, chi2, flux = zip(*ends, strict=True)
+    chi2, best = np.array(chi2), np.zeros(len(fit.chi2), int)
+    best[scenes] = chi2.argmin(axis=0)
+    for k, copy in enumerate(copies):
+        fit._undo(copy, scenes[best[scenes] == k])
+    weight = np.zeros((N_ENDS, len(fit.chi2)))
+    weight[:, scenes] = expit((chi2.min(axis=0) - chi2) / NEED)
+    change = flux - np.array(flux)[best[at[0]], np.arange(len(at[0]))]
+    fit.flux_doubt = np.moveaxis(np.sqrt(weight[:, at[0]])[..., None] * change, 0, -1)
+
+
+def _end(fit, scenes):
+    """Chi2 (k,) of some scenes and fluxes (N, C) of all components, in the views' units."""
+    return fit._chi2_as_expected(scenes), _fluxes(fit)
 
 
 def _fluxes(fit):

@@ -10,7 +10,7 @@ from ..linear.component_batch import peaks_of, renumbered
 from ..linear.equations import N_PARAMETERS, normal_equations
 from ..linear.linearised_scenes import LinearisedScenes
 from ..linear.spectra import MODEL_ERROR, add_diagonal
-from .close_pairs import run_from_equal_profiles
+from .close_pairs import N_ENDS, run_from_equal_profiles
 from .first_profiles import GROWTH, NEED, first_profiles
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 from .shape_grid import fit_faint_shapes
@@ -49,7 +49,7 @@ class ProfileFit:
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
-    flux_doubt (N, C): change of fluxes, common to a scene, see close_pairs.py
+    flux_doubt (N, C, 3): changes of fluxes, each common to a scene, see close_pairs.py
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -64,7 +64,8 @@ class ProfileFit:
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness = np.zeros(len(shapes))
-        self.flux_scatter, self.flux_doubt = np.zeros((2, *looking.spectra.shape))
+        self.flux_scatter = np.zeros_like(looking.spectra)
+        self.flux_doubt = np.zeros((*looking.spectra.shape, N_ENDS))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
