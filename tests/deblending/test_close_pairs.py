@@ -53,7 +53,7 @@ def test_each_of_two_galaxies_has_its_own_light(device, spoilt, size):
 
 
 def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, monkeypatch):
-    """What the one of two faint galaxies may lose the other gains, by the doubt of the start."""
+    """One of two faint galaxies may have gained light of the other, by the doubt of the start."""
     (known,) = deblend_many([pair(0.01)], device=device)
     doubt = spoilt[0].flux_doubt.copy()
     assert (np.abs(doubt[..., 0]).sum(axis=1) > 0.3 * spoilt[0].looking.spectra.sum(axis=1)).all()

@@ -61,7 +61,7 @@ def test_gains_are_differences_of_chi2(fitted, monkeypatch, n, fit_sky):
             fit._look(scenes, theta[None, None], slopes=False)
             fit.looking.solve(0.0)
             chi2 = fit.looking.compute_residuals(0.0)[0]
-            inside = shape_grid._part_inside(fit.looking.components, theta[None])
+            inside = shape_grid.part_inside(fit.looking.components, theta[None])
             compared.append((chi2, *fit.looking.spectra[0] * inside))
         compared.append(grid)
 

@@ -15,7 +15,7 @@ the profiles: with weights from the model, chi2 would decrease with the flux of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -88,7 +88,7 @@ class StartingPoint:
     sky: np.ndarray
     spectrum_curvature: np.ndarray
     flux_scatter: np.ndarray | float = 0.0
-    flux_doubt: np.ndarray | None = None
+    flux_doubt: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 0)))
 
     def __len__(self):
         return len(self.shapes)
