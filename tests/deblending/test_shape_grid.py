@@ -140,6 +140,15 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
     assert fit.flux_scatter[0, 0] > 1
 
 
+def test_errors_hold_larger_profiles_of_a_galaxy_without_significant_light(fitted):
+    """Ten times the expected size, at signal to noise 4.5: none is significant."""
+    middle = (SIDE_PX / 2, SIDE_PX / 2)
+    image = galaxy(25.0, 6.0, 4.5, middle, (SIDE_PX, SIDE_PX))
+    (fit,), _ = fitted(image, [middle], fit_shifts=False)
+    assert np.exp(fit.theta[0, 0, 0]) < 5
+    assert fit.flux_scatter[0, 0] > 0.3 * image.sum()
+
+
 @pytest.fixture
 def grid():
     """Makes a ShapeGrid with these gains (size, wings), and a fit for it with usual galaxies."""

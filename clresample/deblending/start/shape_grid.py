@@ -15,8 +15,7 @@ are the posterior of size and wings. The prior and the contamination are the pop
 (population.py); unusual galaxies have any size and wings. Errors of fluxes include the flux's
 scatter under this posterior (posterior.py), which is about its mean if most of its weight is of
 unusual galaxies: these get the mean size and wings. Galaxies without significant light stay as they
-are, with that scatter: without it 11 % of fluxes at signal to noise 5 are over 5 errors off, by up
-to 16, and 6 % with it, by up to 8 (30 single galaxies of bench.ladder, seed 7777).
+are, with that scatter, which then includes larger profiles.
 """
 
 from __future__ import annotations
@@ -47,6 +46,9 @@ SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.4, -1.1, -2.6])
 # Further steps for galaxies without significant light, and their ln beta: light of galaxies of r_e
 # over 25 px at signal to noise 10 to 15 is not significant in a small profile (bench.ladder).
 FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
+# Part of the plane of both for which a further step stands, in units of that of others: it is twice
+# as far from the next, with one ln beta for two.
+FAR_AREA = 4.0
 # Smallest decrease of chi2 for another fit.
 MIN_GAIN = 1.0
 # Largest numbers of galaxies of a scene, and of frames' pixels times profiles, rendered at once.
@@ -96,19 +98,22 @@ class ShapeGrid:
 
     def posterior(self, fit):
         """Parameters (4,) to be set, and the scatter (C,) of the flux about theirs."""
-        grid = slice(1, 1 + len(SIZE_STEPS) * len(LN_BETA))
-        theta, flux, gain = self.theta[grid], self.flux[grid], self.gain[grid]
+        near, area = len(SIZE_STEPS) * len(LN_BETA), np.full(len(self.theta) - 1, FAR_AREA)
+        theta, flux, gain = self.theta[1:], self.flux[1:], self.gain[1:]
+        area[:near] = 1
         at = self.scene, self.index, LEARNED
         scatter = fit.population.scatter[at]
         away = (theta[:, LEARNED] - fit.population.mean[at]) / scatter
         usual = np.exp(-np.square(away).sum(axis=1) / 2) / (2 * np.pi * scatter.prod())
         unusual = UNUSUAL / (SIZE_RANGE * WINGS_RANGE)
         prior = (1 - UNUSUAL) * usual + unusual
-        weight = np.exp((gain - gain.max()) / (2 * self.contamination(fit))) * prior
-        weight /= weight.sum()
-        moves = weight @ (unusual / prior) > MIN_UNUSUAL
-        found, about = (weight @ theta, weight @ flux) if moves else (self.theta[0], self.flux[0])
-        return found, np.sqrt(weight @ np.square(flux - about))
+        weight = np.exp((gain - gain.max()) / (2 * self.contamination(fit))) * prior * area
+        own = weight[:near] / weight[:near].sum()
+        moves = own @ (unusual / prior[:near]) > MIN_UNUSUAL
+        found, middle = self.theta[0], self.flux[0]
+        if moves:
+            found, middle = own @ theta[:near], own @ flux[:near]
+        return found, np.sqrt(weight @ np.square(flux - middle) / weight.sum())
 
 
 def _uncertain(fit, scenes):
