@@ -47,7 +47,8 @@ SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.4, -1.1, -2.6])
 # over 25 px at signal to noise 10 to 15 is not significant in a small profile (bench.ladder).
 FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
 # Part of the plane of both for which a further step stands, in units of that of others: it is twice
-# as far from the next, with one ln beta for two.
+# as far from the next, with one ln beta for two. Without further steps 11 % of fluxes at signal to
+# noise 5 are over 5 errors off, and 2 % with them (30 singles of bench.ladder, seed 8989).
 FAR_AREA = 4.0
 # Smallest decrease of chi2 for another fit.
 MIN_GAIN = 1.0
