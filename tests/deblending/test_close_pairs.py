@@ -57,6 +57,8 @@ def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, mo
     (known,) = deblend_many([pair(0.01)], device=device)
     doubt = spoilt[0].flux_doubt.copy()
     assert (np.abs(doubt[..., 0]).sum(axis=1) > 0.3 * spoilt[0].looking.spectra.sum(axis=1)).all()
+    held = np.abs(doubt[:, 0, 2])  # by the end with one shape held
+    assert (held > 0.02 * spoilt[0].looking.spectra[:, 0]).all()
     np.testing.assert_allclose(doubt[1], -doubt[0], atol=0.1 * np.abs(doubt).max())
     bare = ProfileFit.run
 
