@@ -33,6 +33,8 @@ SATELLITE_RE_PX, SATELLITE_SNR, SATELLITE_AWAY_RE = (1.5, 4.0), (20.0, 200.0), (
 COSMOS_TIMES = (4.0, 8.0)
 N_COSMOS = 12  # galaxies of highest signal to noise, of which one is drawn
 WRONG_KIND_RE_PX = (2.0, 8.0)
+CLOSE_RE_PX, CLOSE_SNR, CLOSE_AWAY_PX = (1.5, 12.0), (30.0, 3e3), (0.5, 2.0)
+CLOSE_RATIOS = (0.7, 1.4)  # of the two sizes, and of the two S/N
 
 
 class Limits:
@@ -168,10 +170,21 @@ def galaxy_as_point(rng, scale, limits):
     return [galaxy(rng, scale, limits.steepness(rng), re_px, snr, fitted_as=PointSource)]
 
 
+def close(rng, scale, limits):
+    re_px, snr = limits.size(rng, *CLOSE_RE_PX), limits.brightness(rng, *CLOSE_SNR)
+    place = away(rng, rng.uniform(*CLOSE_AWAY_PX))
+    other = (value * log_uniform(rng, *CLOSE_RATIOS) for value in (re_px, snr))
+    return [
+        galaxy(rng, scale, limits.steepness(rng), re_px, snr),
+        galaxy(rng, scale, limits.steepness(rng), *other, away_px=place),
+    ]
+
+
 CASES = {
     f.__name__: f
     for f in (
         single, neighbour, pair, bulge_disk, giant, cosmos, star_as_galaxy, galaxy_as_point,
+        close,
     )
 }  # fmt: skip
 

@@ -125,7 +125,7 @@ def test_scenes_have_the_signal_to_noise_and_the_flux_of_their_truth(mode):
 def test_every_case_draws_its_sources_in_the_frame():
     from bench.harness.ladder_cases import CASES, Limits, cosmos_catalogue, scene_of
 
-    counts = {"neighbour": 2, "pair": 2, "giant": 9}
+    counts = {"neighbour": 2, "pair": 2, "close": 2, "giant": 9}
     for case in CASES:
         if case == "cosmos" and cosmos_catalogue() is None:
             continue

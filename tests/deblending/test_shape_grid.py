@@ -67,7 +67,7 @@ def test_gains_are_differences_of_chi2(fitted, monkeypatch, n, fit_sky):
             fit._look(scenes, theta[None, None], slopes=False)
             fit.looking.solve(0.0)
             chi2 = fit.looking.compute_residuals(0.0)[0]
-            inside = shape_grid._part_inside(fit.looking.components, theta[None])
+            inside = shape_grid.part_inside(fit.looking.components, theta[None])
             compared.append((chi2, *fit.looking.spectra[0] * inside))
         compared.append(grid)
 
@@ -144,6 +144,15 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
     (fit,), _ = fitted(galaxy(2.5, 6.5, 3), looked=looked)
     np.testing.assert_array_equal(fit.theta, before[0])
     assert fit.flux_scatter[0, 0] > 1
+
+
+def test_errors_hold_larger_profiles_of_a_galaxy_without_significant_light(fitted):
+    """Ten times the expected size, at signal to noise 4.5: none is significant."""
+    middle = (SIDE_PX / 2, SIDE_PX / 2)
+    image = galaxy(25.0, 6.0, 4.5, middle, (SIDE_PX, SIDE_PX))
+    (fit,), _ = fitted(image, [middle], fit_shifts=False)
+    assert np.exp(fit.theta[0, 0, 0]) < 5
+    assert fit.flux_scatter[0, 0] > 0.3 * image.sum()
 
 
 @pytest.fixture

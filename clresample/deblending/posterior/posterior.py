@@ -225,6 +225,9 @@ def with_errors(fit, result, peaks, seen):
     errors = with_core_errors(widened(with_common_error(errors, shapes), outside), by_psf)
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
+    division = np.zeros((*shapes.shape, start.flux_doubt.shape[2]))
+    division[fit.fitted] = start.flux_doubt * fit.unit[:, None]
+    doubts = np.concatenate([doubts, division], axis=2)
     exchanged = exchanged_light(result, posterior.solution, doubted)
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes

@@ -116,6 +116,7 @@ def _as_before(point, begin, chosen):
         drawn_positions=places,
         peaks=peaks,
         flux_scatter=scatter,
+        flux_doubt=begin.flux_doubt,
     )
 
 

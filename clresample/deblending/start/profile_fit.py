@@ -10,6 +10,7 @@ from ..linear.component_batch import peaks_of, renumbered
 from ..linear.equations import N_PARAMETERS, normal_equations
 from ..linear.linearised_scenes import LinearisedScenes
 from ..linear.spectra import MODEL_ERROR, add_diagonal
+from .close_pairs import N_ENDS, run_from_equal_profiles
 from .first_profiles import GROWTH, NEED, first_profiles
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 from .shape_grid import fit_faint_shapes
@@ -48,6 +49,7 @@ class ProfileFit:
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
+    flux_doubt (N, C, 3): changes of fluxes, each common to a scene, see close_pairs.py
     """
 
     def __init__(self, looking: LinearisedScenes, noise, tol=CHI2_TOL):
@@ -61,7 +63,9 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness, self.flux_scatter = np.zeros(len(shapes)), np.zeros_like(looking.spectra)
+        self.brightness = np.zeros(len(shapes))
+        self.flux_scatter = np.zeros_like(looking.spectra)
+        self.flux_doubt = np.zeros((*looking.spectra.shape, N_ENDS))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
@@ -86,6 +90,7 @@ class ProfileFit:
             _run_from_large_galaxies(self, scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
+        run_from_equal_profiles(self, np.flatnonzero(some))
         fit_faint_shapes(self, np.flatnonzero(some))
 
     def _copy(self):
@@ -100,6 +105,14 @@ class ProfileFit:
         self.looking.restore(solution, scenes)
         self.population.reset(scenes, population)
         self._measure_brightness(self.theta)
+
+    def _undo(self, before, scenes):
+        """Restores some scenes (k,) from a `_copy`, with their equations."""
+        self._restore(before, scenes)
+        if len(scenes):
+            self._look(scenes, self.theta, slopes=True)
+            self.looking.compute_residuals(MODEL_ERROR)
+            self._take_equations(scenes)
 
     def fit_part(self, thetas, free, scenes):
         """Fits profiles of some components without the others; their parameters, as `thetas`.
@@ -184,6 +197,11 @@ class ProfileFit:
         """With the priors (k,)."""
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
+    def _chi2_as_expected(self, scenes):
+        """Chi2 (k,) with the priors as they were before any scene was fitted."""
+        learned = self.population.penalty(scenes, self.theta)
+        return self.chi2[scenes] - learned + self.expected.penalty(scenes, self.theta)
+
     def _learn(self, scenes):
         """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
@@ -264,12 +282,6 @@ def _may_hold_large_galaxies(fit):
     return (_growth(fit, fit.begun).max(axis=1) > MAX_GROWTH) | unexplained
 
 
-def _chi2_as_expected(fit, scenes):
-    """Chi2 (k,) with the priors as they were before any scene was fitted."""
-    learned = fit.population.penalty(scenes, fit.theta)
-    return fit.chi2[scenes] - learned + fit.expected.penalty(scenes, fit.theta)
-
-
 def _run_from_large_galaxies(fit, scenes):
     """Fits scenes (k,) of a ProfileFit again from profiles of large galaxies.
 
@@ -277,7 +289,7 @@ def _run_from_large_galaxies(fit, scenes):
     first fit; where the large galaxies are those that grew in it, or some of an earlier fit's, it
     goes on with less doubt.
     """
-    before, chi2 = fit._copy(), _chi2_as_expected(fit, scenes)
+    before, chi2 = fit._copy(), fit._chi2_as_expected(scenes)
     grown = _growth(fit)[scenes] > MIN_GROWTH
     fit.theta[scenes] = fit.expected.mean[scenes]
     fit.population.reset(scenes, fit.expected)
@@ -289,7 +301,7 @@ def _run_from_large_galaxies(fit, scenes):
     same |= fit.is_known[scenes] & (large <= grown).all(axis=1)
     fit._restore(before, scenes[same | ~some])
     _go_on_with_less_doubt(fit, scenes[some])
-    worse = scenes[some & ~(_chi2_as_expected(fit, scenes) < chi2)]
+    worse = scenes[some & ~(fit._chi2_as_expected(scenes) < chi2)]
     fit._restore(before, worse)
     _go_on_with_less_doubt(fit, worse)
 
@@ -318,9 +330,4 @@ def _run_without_doubt(fit, scenes):
         fit.chi2[scenes] += np.subtract(*penalty)
         fit._step(scenes)
         fit._take(scenes)
-        worse = scenes[before[0][scenes] <= fit.chi2[scenes]]
-        fit._restore(before, worse)
-        if len(worse):
-            fit._look(worse, fit.theta, slopes=True)
-            fit.looking.compute_residuals(MODEL_ERROR)
-            fit._take_equations(worse)
+        fit._undo(before, scenes[before[0][scenes] <= fit.chi2[scenes]])

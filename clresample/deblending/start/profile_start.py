@@ -15,7 +15,7 @@ the profiles: with weights from the model, chi2 would decrease with the flux of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -73,7 +73,8 @@ class StartingPoint:
     peaks (n,): by which profiles of unit integral are divided, so that max = 1
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
-    flux_scatter (S, C): of the sources' fluxes by size and wings, see ProfileFit
+    flux_scatter (S, C), flux_doubt (S, C, k): of the sources' fluxes, by size and wings of each
+        alone, and k changes of all of them by the division of light in pairs; see ProfileFit
     """
 
     source: np.ndarray
@@ -87,6 +88,7 @@ class StartingPoint:
     sky: np.ndarray
     spectrum_curvature: np.ndarray
     flux_scatter: np.ndarray | float = 0.0
+    flux_doubt: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 0)))
 
     def __len__(self):
         return len(self.shapes)
@@ -170,8 +172,12 @@ def _point(patch, fit, thetas, sources, b, dark):
         center = positions[sources[i]]
         peaks[k] = profile_peak(c.shape, thetas[i], c.position, center, c.frame)
     power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
-    scatter = np.zeros((len(patch.sources), looking.spectra.shape[1]))
+    n_sources = len(patch.sources)
+    scatter, doubt = (
+        np.zeros((n_sources, *values.shape[1:])) for values in (fit.flux_scatter, fit.flux_doubt)
+    )
     np.add.at(scatter, sources[at], fit.flux_scatter[at])
+    np.add.at(doubt, sources[at], fit.flux_doubt[at])
     return StartingPoint(
         source=sources[at],
         positions=positions,
@@ -184,6 +190,7 @@ def _point(patch, fit, thetas, sources, b, dark):
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
         flux_scatter=scatter,
+        flux_doubt=doubt,
     )
 
 

@@ -181,7 +181,7 @@ def _computed(fit, components):
     right = np.maximum(right, 0)
     flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
     gain = right * flux if looking.ties is None else (right * flux)[:, looking.ties.first]
-    parts = gain.sum(axis=1), flux * _part_inside(listed, theta)[:, None]
+    parts = gain.sum(axis=1), flux * part_inside(listed, theta)[:, None]
     for q, i in enumerate(components):
         at = looking.scene[i], looking.index[i]
         yield i, ShapeGrid(*at, own[q], *(part[owner == q] for part in parts))
@@ -221,7 +221,7 @@ def _products(around, present, owner, first):
     return right, alone, sky
 
 
-def _part_inside(components, theta):
+def part_inside(components, theta):
     """Fractions (n,) of the light of galaxies inside their frames, as if these were round."""
     half = np.array([min(c.frame) for c in components]) / 2
     psf = np.array([np.trace(c.shape.psf_moment) for c in components]) / 2
