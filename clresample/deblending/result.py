@@ -256,7 +256,7 @@ class Result(ResultDisplay):
         (posterior/shared_light.py), of size and wings of faint galaxies (start/shape_grid.py), and
         of the PSF's width (assessment/psf_width.py), which can make fluxes negative. Errors of the
         catalogue are larger where they include light outside the images, a saturated core, or the
-        light of a saturated star beside them.
+        light of a star beside them.
 
         rng: NumPy Generator, or a seed
 

@@ -8,6 +8,7 @@ from helpers import scenes
 from helpers.blends import blend, gaussian, observe, round_component
 
 from clresample import Flag, Grid, Observation, PointSource, catalogue, deblend, fluxes, summary
+from clresample.deblending.assessment.cores import star_variance
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.psf_width import width_errors
 from clresample.deblending.assessment.status import with_misfit_status
@@ -188,16 +189,41 @@ def test_errors_of_a_faint_point_hold_the_light_around_it(sigma_px, kind):
         assert (np.abs(flux - (20, 14, 18)) < 2 * error).all() and (error > 2 * flux).all()
 
 
-@pytest.mark.parametrize("off, status", [(1.02, "converged"), (1.2, "misfit")])
-def test_the_error_of_a_stars_psf_is_no_misfit(off, status):
-    """A bright star whose PSF is passed too narrow: by less than psf_error, and by much more."""
+def beside_stars(off, places, *, extra=0.0):
+    """A fit of stars whose PSF is wider by the factor `off`, and of light that no source has."""
     seen = PSF.gaussian(3.0 * off).images[0]
     half, data = seen.shape[0] // 2, np.random.default_rng(0).normal(0, 1, (1, *GRID.shape))
-    data[0, 40 - half : 41 + half, 42 - half : 43 + half] += 3e5 * seen
-    star = [PointSource(position_px=(40, 42))]
-    found = deblend([Observation(data, PSF.gaussian(3.0), GRID, weights=1.0)], star)
+    for y, x in places:
+        data[0, y - half : y + half + 1, x - half : x + half + 1] += 3e5 * seen
+    data[0] += extra * gaussian(GRID.shape, (65, 20), 9 * np.eye(2))
+    stars = [PointSource(position_px=place) for place in places]
+    return deblend([Observation(data, PSF.gaussian(3.0), GRID, weights=1.0)], stars)
+
+
+@pytest.mark.parametrize(
+    "off, extra, status", [(1.02, 0, "converged"), (1.2, 0, "misfit"), (1.02, 20, "misfit")]
+)
+def test_the_error_of_a_stars_psf_is_no_misfit_and_hides_none(off, extra, status):
+    """PSFs passed too narrow, by less than psf_error and by much more; a galaxy not listed."""
+    found = beside_stars(off, [(40, 42)], extra=extra)
     assert found.status == status
     assert replace(found, psf_error=0.0).misfit.is_wrong
+
+
+def test_variances_of_stars_add_up_about_their_fitted_places():
+    result = beside_stars(1.0, [(40, 42), (40, 50)])
+    one, other = (
+        replace(
+            result, components=(result.components[k],), rendered=(result.rendered[0][k : k + 1],)
+        )
+        for k in (0, 1)
+    )
+    both = star_variance(result, 0)
+    np.testing.assert_allclose(both, star_variance(one, 0) + star_variance(other, 0), rtol=1e-6)
+    elsewhere = tuple(replace(s, position_px=(30, 30)) for s in result.sources)
+    np.testing.assert_array_equal(star_variance(replace(result, sources=elsewhere), 0), both)
+    left, right = star_variance(one, 0)[0, 40, [39, 45]]
+    assert left == pytest.approx(right, rel=1e-4)
 
 
 @pytest.mark.filterwarnings("error")

@@ -130,15 +130,17 @@ def test_exchanged_light_leaves_the_sum_of_two_fluxes_alone():
     found = with_shared_light(errors, doubts, exchanged)
     np.testing.assert_allclose(found.colour[2], doubts[2] @ doubts[2].T)
     np.testing.assert_allclose(found.flux[1, 0, 2], doubts[0, 1] @ doubts[2, 1])
-    changes, rng = flux_changes(doubts, exchanged), np.random.default_rng(0)
+    of_both = np.diagonal(found.colour, axis1=1, axis2=2), np.diagonal(found.flux, axis1=1, axis2=2)
+    np.testing.assert_allclose(of_both[0], of_both[1].T)
+    apart = np.array([[0.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    changes, rng = flux_changes(doubts, exchanged, apart), np.random.default_rng(0)
     drawn = np.array([changes.draw(3, rng) for _ in range(4000)])  # (n, S, C)
+    found.flux[1, 0, 0] += 9
     scale = np.sqrt(np.diagonal(found.flux, axis1=1, axis2=2))
     products = np.einsum("nsc,ntc->cst", drawn, drawn) / len(drawn)
     correlation = (products - found.flux) / (scale[:, :, None] * scale[:, None])
     np.testing.assert_allclose(correlation, 0, atol=0.06)
-    assert flux_changes(0 * doubts, 0 * exchanged) is None
-    of_both = np.diagonal(found.colour, axis1=1, axis2=2), np.diagonal(found.flux, axis1=1, axis2=2)
-    np.testing.assert_allclose(of_both[0], of_both[1].T)
+    assert flux_changes(0 * doubts, 0 * exchanged, 0 * apart) is None
 
 
 def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypatch):

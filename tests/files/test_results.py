@@ -91,6 +91,7 @@ def rich(rng, grid, other, **given):
         losses=rng.random(17),
         status=Ended.FAILED,
         messages=("one 'line'", 'another\twith "quotes"'),
+        psf_error=0.03,
         seconds={"set-up": 1 / 3, "fit": np.float64(2 / 7)},
         **given,
     )
@@ -160,6 +161,7 @@ def test_the_comparison_sees_a_last_bit(tmp_path):
         {"sky": np.nextafter(found.sky, 2)},
         {"frame": Frame(Grid.from_wcs(wcs, (30, 33)), found.frame.psf)},
         {"seconds": {}},
+        {"psf_error": 0.02},
         {"sources": found.sources[::-1]},
     ):
         with pytest.raises(AssertionError):

@@ -35,7 +35,9 @@ def core_errors(result) -> np.ndarray:
                 own = field.flux_error[star] * flux
                 found[source, channels] = np.hypot(found[source, channels], own)
             others = {s: model for s, model in models.items() if s != source}
-            errors = _neighbour_errors(result, i, k, others, place)
+            # wings that were measured do not follow from the width of a core
+            is_measured = star is not None and not field.keeps_core[star]
+            errors = _neighbour_errors(result, i, k, others, None if is_measured else place)
             found[:, channels] = np.hypot(found[:, channels], errors)
     return result.psf_error * found
 
@@ -45,7 +47,8 @@ def star_variance(result, i) -> np.ndarray:
 
         psf_error^2 sum over stars of L^2 + (r . grad L)^2
 
-    as weights of the start have it: of light L at r from a star, see `_star_changes`.
+    as weights of the start have it: of light L at r from a star, of measured wings too, since a
+    result that was read does not tell them.
     """
     found = np.zeros(result.footprints[i].used.shape)
     if result.psf_error:
@@ -58,16 +61,21 @@ def star_variance(result, i) -> np.ndarray:
 def _stars(result, i):
     """Yields each star's component in observation i, its number in a StarPSFs or None, its place.
 
-    The place is None where wings were measured: they do not follow from the width of a core.
+    The place (2,) [px] is that of the fit, with the shift of the observation.
     """
-    field, grid = result.observations[i].psf_field, result.observations[i].grid
+    observation, grid = result.observations[i], result.frame.grid
     for k, component in enumerate(result.components):
         source = result.sources[component.source]
-        if isinstance(source, PointSource):
-            (place,) = result.frame.grid.positions_in(grid, *result.frame.positions_of([source]).T)
-            star = field.number_at(*place) if isinstance(field, StarPSFs) else None
-            is_measured = star is not None and not field.keeps_core[star]
-            yield k, star, None if is_measured else place
+        if not isinstance(source, PointSource):
+            continue
+        light = component.morphology / max(component.morphology.sum(), 1e-300)
+        center = [(light * index).sum() for index in np.indices(light.shape)]
+        at = np.add(component.origin, center) - result.shifts[i]
+        star, field = None, observation.psf_field
+        if isinstance(field, StarPSFs):
+            (listed,) = grid.positions_in(observation.grid, *result.frame.positions_of([source]).T)
+            star = field.number_at(*listed)
+        yield k, star, grid.positions_in(observation.grid, *at)
 
 
 def _star_changes(result, i, k, place):
@@ -111,12 +119,14 @@ def _neighbour_errors(result, i, k, models, place):
     models: {s: `_model`} of the other sources; place (2,) [px]: of the star, from which r is; None
         leaves the width out
     """
-    weights = np.where(result.footprints[i].used, result.observations[i].weights, 0.0)
+    used, weights = result.footprints[i].used, result.observations[i].weights
     out = np.zeros((len(result.sources), len(weights)))
     own, changes = _star_changes(result, i, k, place)
-    lowered = 1 + weights[:, *own] * result.psf_error**2 * sum(change**2 for change in changes)
+    beside = np.where(used[:, *own], weights[:, *own], 0.0)
+    lowered = 1 + beside * result.psf_error**2 * sum(change**2 for change in changes)
     if not lowered.max(initial=1.0) > 1 + MIN_PSF_ERROR_SIGMA**2:
         return out
+    weights = np.where(used, weights, 0.0)
     weights[:, *own] /= lowered
     for s, (window, model, flux) in models.items():
         shared = _overlap(window, own)

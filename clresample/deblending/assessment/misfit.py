@@ -111,7 +111,8 @@ def misfit_of(result) -> Misfit:
 def _of_channel(rest, c, n_sources, noise):
     """excess, chi2, light (S + 2,) of a channel of a Remainder, the last two for the whole.
 
-    noise (My, Mx): variance of its residual [sigma^2]
+    noise (My, Mx): variance of its residual [sigma^2]. Pixels where that is mostly the error of
+        stars' PSFs would hide others' chi2: the larger excess with and without them counts
     """
     used, owner = rest.used[c], rest.owner[c]
 
@@ -120,20 +121,27 @@ def _of_channel(rest, c, n_sources, noise):
         found = np.bincount(owner[own], values[own], n_sources)
         return np.concatenate([found, [found.sum(), values[where].sum()]])
 
-    count = sums(used, np.ones(used.shape))
-    with np.errstate(invalid="ignore"):
-        chi2 = sums(used, rest.residual[c] ** 2 / noise) / count
+    def of_pixels(where):
+        count = sums(where, np.ones(where.shape))
+        with np.errstate(invalid="ignore"):
+            chi2 = sums(where, rest.residual[c] ** 2 / noise) / count
+        excess = chi2_excess(chi2, count)
+        if (excess > MISFIT_SIGMAS).any():  # if not, nor with fewer independent pixels
+            excess = chi2_excess(chi2, count / correlation_sum(rest.residual[c], rest.sky[c]))
+        return excess, chi2
+
+    excess, chi2 = of_pixels(used)
+    by_noise = used & (noise < 2 * rest.noise[c])
+    if by_noise.sum() < used.sum():
+        found, chi2_by_noise = of_pixels(by_noise)
+        chi2 = np.where(found > excess, chi2_by_noise, chi2)
+        excess = np.fmax(excess, found)
     size = np.nan_to_num(np.abs(rest.filtered[c]))
     left = np.where(size > LEFT_SIGMAS, size, 0.0) - LEFT_BY_NOISE
     seen = used & np.isfinite(rest.filtered[c])
     light = sums(seen, rest.power[c] * np.nan_to_num(rest.point[c]) * left)
     points = np.where(size > MISFIT_SIGMAS, size * np.nan_to_num(rest.point[c]), 0.0)
     np.maximum.at(light, np.where(owner < 0, n_sources + 1, owner)[seen], points[seen])
-    excess = chi2_excess(chi2, count)
-    if (
-        excess > MISFIT_SIGMAS
-    ).any():  # otherwise it is no misfit even if few pixels are independent
-        excess = chi2_excess(chi2, count / correlation_sum(rest.residual[c], rest.sky[c]))
     return excess, chi2, np.maximum(light, 0.0)
 
 

@@ -61,6 +61,9 @@ MIN_RISE_SIGMAS = 3.0
 # [sigma] Smallest light of a halo at the edge of the PSF's image: fainter ones are not worth the
 # time that a PSF of its own takes in each window of a start.
 MIN_HALO_SIGMAS = 0.25
+# Largest side of the PSF of a star with a halo: that of a star in 400 px, with 10 samples a pixel,
+# would take 9 s and 1.4 GB.
+MAX_HALO_SAMPLES = 1200
 # [1] Largest ratio of a halo to the PSF at the edge of its image: more light is of galaxies.
 MAX_HALO_RATIO = 2.0
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
@@ -255,7 +258,7 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         ):
             return None
         lit = np.flatnonzero(light > LIGHT_SIGMAS).max(initial=0)
-        reach = max(float(lit), radius + fwhm)
+        reach = max(min(float(lit), MAX_HALO_SAMPLES * step / 2), radius + fwhm)
         low, high = np.maximum(low, -reach), np.minimum(high, reach)
     y, x = (
         np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step

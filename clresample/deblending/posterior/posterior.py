@@ -232,10 +232,7 @@ def with_errors(fit, result, peaks, seen):
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
-    s, c = np.nonzero(widths)  # independent of one another
-    by_width = np.zeros((*widths.shape, len(s)))
-    by_width[s, c, np.arange(len(s))] = widths[s, c]
-    changes = flux_changes(np.concatenate([doubts, changes, by_width], axis=2), exchanged)
+    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, widths)
     draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
 

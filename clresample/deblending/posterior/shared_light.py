@@ -215,18 +215,22 @@ def with_shared_light(errors, doubts, exchanged):
     return replace(errors, flux=flux, colour=colour)
 
 
-def flux_changes(doubts, exchanged):
+def flux_changes(doubts, exchanged, apart):
     """The FluxChanges that scatter as `with_shared_light` adds to errors; None without any.
 
-    doubts (S, C, k), exchanged (S, S, C) [counts]: see there
+    doubts (S, C, k), exchanged (S, S, C) [counts]: see there; apart (S, C) [counts]: scatter of
+        fluxes, each independent of all others
     """
     source, doubt = np.nonzero(doubts.any(axis=1))
     giver, taker = np.nonzero(exchanged.any(axis=2))
-    if not len(source) + len(giver):
+    lone, channel = np.nonzero(apart)
+    if not len(source) + len(giver) + len(lone):
         return None
     pairs, light = doubts.shape[2] + np.arange(len(giver)), exchanged[giver, taker]
+    alone = doubts.shape[2] + len(giver) + np.arange(len(lone))
+    by = np.eye(apart.shape[1])[channel] * apart[lone, channel, None]
     return FluxChanges(
-        np.concatenate([source, giver, taker]),
-        np.unique(np.concatenate([doubt, pairs, pairs]), return_inverse=True)[1],
-        np.concatenate([doubts[source, :, doubt], light, -light]),
+        np.concatenate([source, giver, taker, lone]),
+        np.unique(np.concatenate([doubt, pairs, pairs, alone]), return_inverse=True)[1],
+        np.concatenate([doubts[source, :, doubt], light, -light, by]),
     )
