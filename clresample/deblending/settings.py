@@ -88,13 +88,13 @@ class Settings(FitSettings):
     errors: compute errors that include morphologies and neighbours. False
         takes two thirds of the time; then flux errors are those at fixed morphologies, and sizes
         have none
-    psf_error [1]: relative error of PSF widths. This fraction of a bright point source's light,
-        and more in its wings, is added to the noise of its pixels, so that residuals of a star are
-        not fitted by its neighbours. Errors of fluxes hold it beside stars, and of sources that
-        leave over 5 sigma; the status of a fit counts it as noise in stars' light. The weights use the stars' light at the start of the fit, and
-        are then constant. Stars whose error is below 0.05 sigma everywhere have no effect. Beside a
-        star of signal to noise 1e4 whose PSF is 1 % too wide, the SDR of galaxies increases from
-        7.7 to 12.0 dB (bench.stars, docs/noise.md). Larger
+    psf_error [1]: relative error of PSF widths. This fraction of a bright point source's light, and
+        more in its wings, is added to the noise of its pixels, so that residuals of a star are not
+        fitted by its neighbours. Errors of fluxes hold it beside stars, and of sources that leave
+        over 5 sigma; the status of a fit counts it as noise in stars' light. The weights use the
+        stars' light at the start of the fit, and are then constant. Stars whose error is below 0.05
+        sigma everywhere have no effect. Beside a star of signal to noise 1e4 whose PSF is 1 % too
+        wide, the SDR of galaxies increases from 7.7 to 12.0 dB (bench.stars, docs/noise.md). Larger
         values allow for worse PSFs, and cost precision
     psf_tolerance [1]: largest error of each source's PSF if PSFs vary over an observation
         (PSFField), relative to the norm of its samples (PSFBasis.max_error). Fits use different
