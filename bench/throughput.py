@@ -13,7 +13,8 @@ wall_s              of the whole: set-up, fit, errors, result, catalogue; also s
 galsim_ms           processor time of one GalSim quintic render of one band, EUCLID -> RUBIN at
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
-host_ms_a_scene     thread time of the calling thread, which a faster device would leave
+host_ms_a_scene     thread time of the calling thread, which a faster device would leave; with
+                    processes that of the waiting one, as peak_gb
 host_ms             of that by stage, likewise a scene; and the time of a round of learning
 stage               seconds of wall time by stage, as results have them, and of catalogues; of
                     results that threads make side by side, those of each

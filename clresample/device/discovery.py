@@ -9,6 +9,7 @@ import functools
 import os
 import sys
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -198,10 +199,13 @@ def warn_hidden_gpus():
     found = find_devices()
     if named_library() or os.environ.get("OCL_ICD_VENDORS"):  # the user's own choice of drivers
         return
-    for vendor, path in undetected_drivers(_served(found)):
-        if not is_registered(path):
-            advice = driver_advice(vendor, path, _addresses(found))
-            warnings.warn(f"{HIDDEN_GPU}: {advice}", DeviceWarning, stacklevel=3)
+    advice = []
+    with suppress(OSError, ValueError):  # files that cannot be read harm nobody
+        for vendor, path in undetected_drivers(_served(found)):
+            if not is_registered(path):
+                advice.append(driver_advice(vendor, path, _addresses(found)))
+    for line in advice:
+        warnings.warn(f"{HIDDEN_GPU}: {line}", DeviceWarning, stacklevel=3)
 
 
 def _served(found):

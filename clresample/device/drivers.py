@@ -172,9 +172,8 @@ def _remove_of_gone(entry, pid):
 
 
 def is_registered(path):
-    """True of a driver library that the OpenCL loader, or the system's own, has in its list."""
-    listed = _known() | (_read(VENDORS) if conda_prefix() else {})
-    return path.name in {Path(library).name for library in listed.values()}
+    """True of a driver library that the OpenCL loader has in its list."""
+    return path.name in {Path(library).name for library in _known().values()}
 
 
 def driver_advice(vendor, path, served):
@@ -183,14 +182,12 @@ def driver_advice(vendor, path, served):
     served: see `driver_fault`
     """
     driver = f"{vendor}'s OpenCL driver"
-    if path.name in {Path(library).name for library in _known().values()}:
+    if is_registered(path):
         fault = driver_fault(str(path), served) or "brings no GPU"
         return f"{driver}, {path}, {fault}: is the GPU given to this machine or container?"
-    if is_registered(path):
-        return (
-            f"{driver} is at {path}, which the loader of {conda_prefix()} does not read: "
-            f"{CONDA_CURE}"
-        )
+    conda = conda_prefix()
+    if conda and path.name in {Path(library).name for library in _read(VENDORS).values()}:
+        return f"{driver} is at {path}, which the loader of {conda} does not read: {CONDA_CURE}"
     return f"{driver} is at {path}, where the OpenCL loader does not look: {icd_export_line(path)}"
 
 
@@ -213,7 +210,7 @@ def _libraries():
         folders += sorted(Path("/").glob(pattern[1:]))
     found = [path for path in listed if path.name in LIBRARIES]
     found += [folder / name for folder in folders for name in LIBRARIES]
-    return [path for path in dict.fromkeys(found) if path.is_file()]
+    return [path for path in dict.fromkeys(found) if os.path.isfile(path)]
 
 
 def _known():

@@ -7,7 +7,7 @@ from helpers.scenes import blend
 from clresample import Settings
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.fit import Fit, start_fits
-from clresample.deblending.start.close_pairs import run_from_equal_profiles
+from clresample.deblending.start.close_pairs import _larger_neighbours, run_from_equal_profiles
 from clresample.deblending.start.profile_fit import ProfileFit
 
 FLUX = np.array((3000.0, 2500, 2100))
@@ -74,11 +74,28 @@ def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, mo
     np.testing.assert_allclose(added, changes @ changes.swapaxes(1, 2), rtol=1e-3)
 
 
+@pytest.mark.parametrize("doubt, found", [((9.0, 200.0), [(1, 0)]), ((1.0, 2.0), [])])
+def test_a_galaxy_without_its_light_is_told_by_that_of_others_about_it(
+    device, monkeypatch, doubt, found
+):
+    """Not by sizes alone: wings take light too."""
+    seen = []
+
+    def run(fit):
+        fit.theta[0] = SMALL, SMALL
+        fit._take(SCENES)
+        fit._step(SCENES)
+        fit.population.contamination[0, :2] = doubt
+        seen.extend(_larger_neighbours(fit, 0))
+
+    monkeypatch.setattr(ProfileFit, "run", run)
+    start_fits([Fit(pair(1.0), Settings(), device, np.float32, pad=1)])
+    assert seen == found
+
+
 def test_galaxies_apart_are_not_started_again(device, spoilt, monkeypatch):
-    """Nor are those of a size."""
     steps, real = [], ProfileFit._step
     monkeypatch.setattr(ProfileFit, "_step", lambda *a, **k: steps.append(1) or real(*a, **k))
-    for place in ((40, 40), (27.5, 25)):
-        start_fits([Fit(pair(1.0, place=place), Settings(), device, np.float32, pad=1)])
-    assert len(steps) == 2
+    start_fits([Fit(pair(1.0, place=(40, 40)), Settings(), device, np.float32, pad=1)])
+    assert len(steps) == 1
     assert not any(fit.flux_doubt.any() for fit in spoilt)

@@ -73,7 +73,11 @@ def _fluxes(fit):
 
 
 def _larger_neighbours(fit, b):
-    """Pairs (component, the nearest larger one of its close pairs) in scene b."""
+    """Pairs (component, the nearest one that may have its light) in scene b.
+
+    That is a larger one, or, since a profile takes light with its wings too, any if the light of
+    others about the component is significant, and less so about that one.
+    """
     components, theta = fit.looking.components, fit.thetas()
     at = [
         i
@@ -87,6 +91,9 @@ def _larger_neighbours(fit, b):
     place = np.array([components[i].position for i in at])
     away = np.linalg.norm((place[:, None] - place) / radius, axis=2)  # of the second one's radii
     size = np.sqrt(radius.prod(axis=1))
-    away = np.where(size > MIN_RATIO * size[:, None], away, np.inf)
+    doubt = fit.population.contamination[*np.array(fit.at)[:, at]]
+    poorer = (doubt[:, None] > NEED) & (doubt[:, None] > doubt)
+    away = np.where((size > MIN_RATIO * size[:, None]) | poorer, away, np.inf)
+    np.fill_diagonal(away, np.inf)
     nearest = away.argmin(axis=1)
     return [(at[k], at[j]) for k, j in enumerate(nearest) if away[k, j] < MAX_AWAY]

@@ -107,17 +107,19 @@ class ShapeGrid:
         scatter, contamination = fit.population.scatter[at], self.contamination(fit)
         away = (theta[:, LEARNED] - fit.population.mean[at]) / scatter
         usual = np.exp(-np.square(away).sum(axis=1) / 2) / (2 * np.pi * scatter.prod())
+        found, about, n_near = self.theta[0], self.flux[0], len(SIZE_STEPS) * len(LN_BETA)
+        near = np.exp((gain[:n_near] - gain[:n_near].max()) / (2 * contamination))
+        weight, unusual = _weights(near, usual[:n_near], UNUSUAL)
+        if unusual > MIN_UNUSUAL and self.gain.max() >= NEED * contamination:
+            found, about = weight @ theta[:n_near], weight @ flux[:n_near]
         likelihood = np.exp((gain - gain.max()) / (2 * contamination))
-        likelihood[len(SIZE_STEPS) * len(LN_BETA) :] *= FAR_WEIGHT
-        weight, share = _weights(likelihood, usual, UNUSUAL)
-        moves = share > MIN_UNUSUAL and self.gain.max() >= NEED * contamination
-        found, about = (weight @ theta, weight @ flux) if moves else (self.theta[0], self.flux[0])
+        likelihood[n_near:] *= FAR_WEIGHT
         weight, _ = _weights(likelihood, usual, UNUSUAL_IN_ERRORS)
         return found, np.sqrt(weight @ np.square(flux - about))
 
 
 def _weights(likelihood, usual, fraction):
-    """Posterior weights (K,) of profiles with this fraction of unusual galaxies, and their part.
+    """Posterior weights (K,) of profiles with a fraction of unusual galaxies, and that of these.
 
     usual (K,): density of the prior of others
     """
