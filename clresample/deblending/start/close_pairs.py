@@ -22,8 +22,8 @@ from .first_profiles import NEED
 from .shape_grid import part_inside
 
 # A close pair's largest distance, in units of the larger one's radius, and the smallest ratio of
-# the two radii, at which profiles fall to this fraction of their peak. Of 120 galaxies in close pairs
-# none is silently wrong (bench.ladder, seed 52525); of 200 without further starts 18 are (seed 21).
+# the two radii, at which profiles fall to this fraction of their peak. Of 120 galaxies in pairs
+# none is silently wrong (bench.ladder, close, seed 52525); of 200 without further starts 18 are.
 MAX_AWAY, MIN_RATIO, RADIUS_LEVEL = 0.5, 1.5, 0.1
 N_ENDS = 3  # before, of both profiles, with one of them held
 
