@@ -99,6 +99,14 @@ def window_of(rendered, i, margin=0):
     )
 
 
+def joint_window(rendered, parts):
+    """Slices (y, x) of a window that holds the light of some components, and so their boxes."""
+    windows = [window_of(rendered, i) for i in parts]
+    return tuple(
+        slice(min(w[k].start for w in windows), max(w[k].stop for w in windows)) for k in (0, 1)
+    )
+
+
 def image_within(rendered, i, window):
     """Component i's image (Co, ny, nx) on a window (slices y, x) that contains its own."""
     if isinstance(rendered, ComponentImages):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
 
-from clresample.deblending.component_images import ComponentImages
-from clresample.deblending.posterior.residuals import _window, max_filtered_residuals
+from clresample.deblending.component_images import ComponentImages, joint_window
+from clresample.deblending.posterior.residuals import max_filtered_residuals
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import box_chi2
@@ -183,6 +183,6 @@ def test_a_window_holds_the_light_of_all_components():
     rendered = ComponentImages.cropped(
         (2, 1, 40, 40), np.array([[3, 4], [20, 25]]), [np.ones((1, 6, 7)), np.ones((1, 8, 9))]
     )
-    assert _window(rendered, [0, 1]) == (slice(3, 28), slice(4, 34))
-    assert _window(rendered, [1]) == (slice(20, 28), slice(25, 34))
-    assert _window(np.ones((2, 1, 40, 41)), [0, 1]) == (slice(0, 40), slice(0, 41))
+    assert joint_window(rendered, [0, 1]) == (slice(3, 28), slice(4, 34))
+    assert joint_window(rendered, [1]) == (slice(20, 28), slice(25, 34))
+    assert joint_window(np.ones((2, 1, 40, 41)), [0, 1]) == (slice(0, 40), slice(0, 41))

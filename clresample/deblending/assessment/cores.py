@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...sky.box import intersect_boxes
 from ...sky.sources import PointSource
-from ..component_images import image_within, window_of
+from ..component_images import image_within, joint_window, window_of
 from ..inspection.star_psfs import StarPSFs
 from ..start.star_weights import MIN_PSF_ERROR_SIGMA
 
@@ -101,8 +102,7 @@ def _model(result, i, parts):
     spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
     spectra = np.where(spectra.any(axis=0), spectra, 1.0)
     flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
-    sides = zip(*(window_of(rendered, j) for j in parts), strict=True)
-    window = tuple(slice(min(s.start for s in w), max(s.stop for s in w)) for w in sides)
+    window = joint_window(rendered, parts)
     images = (image_within(rendered, j, window) for j in parts)
     model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
     return window, model, flux
@@ -129,12 +129,12 @@ def _neighbour_errors(result, i, k, models, place):
     weights = np.where(used, weights, 0.0)
     weights[:, *own] /= lowered
     for s, (window, model, flux) in models.items():
-        shared = _overlap(window, own)
-        if shared is None:
+        here, there = intersect_boxes(*_box(window), *_box(own))
+        if not changes[0][:, *there].size:
             continue
         weighted = weights[:, *window] * model
         power = (weighted * model).sum((1, 2))
-        sums = [(weighted[:, *shared[0]] * one[:, *shared[1]]).sum((1, 2)) for one in changes]
+        sums = [(weighted[:, *here] * one[:, *there]).sum((1, 2)) for one in changes]
         right = np.linalg.norm(sums, axis=0) * flux
         out[s] = np.divide(right, power, out=np.zeros_like(right), where=power > 0)
     return out
@@ -146,18 +146,9 @@ def _widening(light, away):
     return sum((r * np.gradient(light, axis=axis) for axis, r in axes), np.zeros_like(light))
 
 
-def _overlap(*windows):
-    """The part that two windows (slices y, x) share, as slices of each; None without any."""
-    sides = [
-        (max(s.start for s in pair), min(s.stop for s in pair))
-        for pair in zip(*windows, strict=True)
-    ]
-    if any(low >= high for low, high in sides):
-        return None
-    return [
-        tuple(slice(a - s.start, b - s.start) for (a, b), s in zip(sides, window, strict=True))
-        for window in windows
-    ]
+def _box(window):
+    """Origin and shape (2,) [px] of a window (slices y, x)."""
+    return tuple(zip(*((part.start, part.stop - part.start) for part in window), strict=True))
 
 
 def with_core_errors(errors, cores):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
-from ..component_images import image_within, window_of
+from ..component_images import image_within, joint_window
 from ..solver.multiscale.prior import gaussian
 
 # [sigma] Filtered residual from which a source is flagged as misfitted: noise reaches it in one of
@@ -216,20 +216,12 @@ def pixels_in_boxes(result, i_observation, positions):
     owners = np.array([c.source for c in result.components], int)
     for s in np.unique(owners):
         parts = np.flatnonzero(owners == s)
-        window = _window(result.rendered[i_observation], parts)
+        window = joint_window(result.rendered[i_observation], parts)
         (y, x), inside = np.moveaxis(positions[window], -1, 0), None
         for (y0, x0), (n_y, n_x) in (boxes[i] for i in parts):
             one = (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
             inside = one if inside is None else inside | one
         yield s, window, inside
-
-
-def _window(rendered, parts):
-    """A window that holds the light of some components, and so their boxes."""
-    windows = [window_of(rendered, i) for i in parts]
-    return tuple(
-        slice(min(w[k].start for w in windows), max(w[k].stop for w in windows)) for k in (0, 1)
-    )
 
 
 def _light(result, i_observation, source, window):
