@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from ...device.tuning import Tuning
@@ -150,6 +152,18 @@ class LinearisedScenes:
         return LinearisedScenes(
             components, self.sights, self.n_scenes, *device, fit_sky=self.fit_sky
         )
+
+    def without_light(self, spectra) -> LinearisedScenes:
+        """The scenes rendered last without light of their components, at fixed sky levels.
+
+        spectra (N, C): of the light
+        """
+        out = copy(self)
+        out.sights = [
+            s.without_light(self.scenes, self.slots, spectra[self.at]) for s in self.sights
+        ]
+        out.fit_sky = False
+        return out
 
     def light_products(self, sky, error=0.0):
         """Products (N, C) of each component's whitened image with the data's light and with itself.

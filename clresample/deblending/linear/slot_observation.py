@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -148,6 +149,19 @@ class SlotObservation:
             sums=self.sums,
         )
         return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
+
+    def without_light(self, scenes, slots, spectra) -> SlotObservation:
+        """This observation without the slots' light in the data of scenes (k,).
+
+        spectra (slots, C): of the light
+        """
+        sky = np.zeros((len(self.views), spectra.shape[1]))
+        self.compute_residuals(scenes, slots, spectra, sky, 0.0)
+        data, root, rest = self.device.get_all([self.data, self.root, self.residual])
+        seen = np.isin(np.arange(len(root)), scenes)[:, None, None, None] & (root > 0)
+        out, rest = copy(self), np.divide(rest, root, out=data, where=seen)
+        out.data = self.device.put(rest)
+        return out
 
     def overlapping_pairs(self):
         """Table (pairs, 6) of slots a <= b of one scene whose windows overlap on the pixels.

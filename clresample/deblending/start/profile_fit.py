@@ -10,7 +10,7 @@ from ..linear.component_batch import peaks_of, renumbered
 from ..linear.equations import N_PARAMETERS, normal_equations
 from ..linear.linearised_scenes import LinearisedScenes
 from ..linear.spectra import MODEL_ERROR, add_diagonal
-from .close_pairs import N_ENDS, run_from_equal_profiles
+from .close_pairs import run_from_equal_profiles
 from .first_profiles import GROWTH, NEED, first_profiles
 from .population import OWN_LIGHT, PopulationPrior, contamination_factors
 from .shape_grid import fit_faint_shapes
@@ -49,7 +49,7 @@ class ProfileFit:
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
-    flux_doubt (N, C, 3): changes of fluxes, each common to a scene, see close_pairs.py
+    flux_doubt (N, C, k): changes of fluxes, each of close pairs, see close_pairs.py
     """
 
     def __init__(self, looking: LinearisedScenes, noise, tol=CHI2_TOL):
@@ -65,7 +65,7 @@ class ProfileFit:
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness = np.zeros(len(shapes))
         self.flux_scatter = np.zeros_like(looking.spectra)
-        self.flux_doubt = np.zeros((*looking.spectra.shape, N_ENDS))
+        self.flux_doubt = np.zeros((*looking.spectra.shape, 0))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
@@ -114,6 +114,19 @@ class ProfileFit:
             self.looking.compute_residuals(MODEL_ERROR)
             self._take_equations(scenes)
 
+    def part(self, looking, chosen):
+        """ProfileFit of some components (k,) alone, at their present parameters and expectations.
+
+        looking: LinearisedScenes of these observations
+        """
+        components = renumbered(self.looking.components[i] for i in chosen)
+        part = ProfileFit(looking.with_components(components), self.noise, self.tol)
+        here = tuple(np.array(self.at)[:, chosen])
+        part.theta[part.at] = self.theta[here]
+        for name in ("mean", "scatter"):
+            getattr(part.population, name)[part.at] = getattr(self.population, name)[here]
+        return part
+
     def fit_part(self, thetas, free, scenes):
         """Fits profiles of some components without the others; their parameters, as `thetas`.
 
@@ -121,8 +134,7 @@ class ProfileFit:
             fitted, others stay as they are
         """
         here = [i for i in thetas if self.looking.scene[i] in scenes]
-        part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
-        fit = ProfileFit(part, self.noise)
+        fit = self.part(self.looking, here)
         for b, k, i in zip(*fit.at, here, strict=True):
             fit.theta[b, k, : len(thetas[i])] = thetas[i]
             fit.moves[b, k] = i in free
