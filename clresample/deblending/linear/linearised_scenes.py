@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
 from ...device.tuning import Tuning
-from .component_batch import ComponentBatch, boxes_of, profile_thresholds
+from .component_batch import ComponentBatch, boxes_of, profile_thresholds, renumbered
 from .equations import ImageProducts
 from .slot_observation import SlotObservation
 from .spectra import nnls_batch, spectrum_covariance
@@ -154,15 +155,30 @@ class LinearisedScenes:
         )
 
     def without_light(self, spectra) -> LinearisedScenes:
-        """The scenes rendered last without light of their components, at fixed sky levels.
+        """The scenes rendered last, light of their components removed from the data.
 
         spectra (N, C): of the light
         """
+        given = self.scenes, self.slots, spectra[self.at]
         out = copy(self)
-        out.sights = [
-            s.without_light(self.scenes, self.slots, spectra[self.at]) for s in self.sights
-        ]
-        out.fit_sky = False
+        out.sights = [sight.without_light(*given) for sight in self.sights]
+        return out
+
+    def cut(self, numbers, chosen, scenes, windows) -> LinearisedScenes:
+        """Windows of scenes (k,), which may repeat, as scenes with some of the components.
+
+        Sky levels are fixed at the present ones.
+
+        chosen (n,): these components, numbers (n,): the new scene of each
+        windows: of each observation first pixels (k, 2) and size (2,)
+        """
+        pairs = zip(numbers.tolist(), chosen.tolist(), strict=True)
+        components = renumbered(replace(self.components[i], scene=k) for k, i in pairs)
+        pairs = zip(self.sights, windows, strict=True)
+        sights = [sight.cut(scenes, *window) for sight, window in pairs]
+        device = self.device, self.dtype, self.tuning
+        out = LinearisedScenes(components, sights, len(scenes), *device, fit_sky=False)
+        out.sky[:] = self.sky[scenes]
         return out
 
     def light_products(self, sky, error=0.0):

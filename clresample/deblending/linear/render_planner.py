@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,9 +60,18 @@ class RenderPlanner:
         # distorted ones are alone
         layouts = [id(p) if p.geometry == "distorted" else p.layout for p in self._plans]
         self._layout = np.array([layouts.index(layouts[i]) for i in self._plan])
+        self._alike = {int(k): np.unique(self._plan[self._layout == k]) for k in self._layout}
         self._distorted = np.array([p.geometry == "distorted" for p in plans])
         self._reach = [reach_of(p, tolerance) for p in self._plans]
         self._renderers: dict[object, _WindowRenderer | BoxRenderer] = {}
+
+    def of_scenes(self, scenes) -> RenderPlanner:
+        """The planner of some of the scenes (k,), which may repeat, with the same renderers."""
+        out = copy(self)
+        out.views = [self.views[b] for b in scenes]
+        for name in ("_plan", "_layout", "_distorted"):
+            setattr(out, name, getattr(self, name)[scenes])
+        return out
 
     def runs(self, slots):
         """Yields the RenderRuns of slots."""
@@ -105,8 +115,7 @@ class RenderPlanner:
             PaddedMapping.window_size(plan.mapping, shape, reach)
             for plan, reach in zip(self._plans, self._reach, strict=True)
         ]
-        alike = np.unique(self._plan[self._layout == layout])
-        size = None
+        alike, size = self._alike[layout], None
         if len(alike) > 1:
             most = np.max([own[i] for i in alike], axis=0)
             size = tuple(round_up(most, SIZE_PX).tolist())
@@ -146,7 +155,7 @@ class RenderPlanner:
         low = np.array([rows[0], columns[0]])
         size = np.array([rows[-1], columns[-1]]) + 1 - low
         margin = int(np.ceil(reach))
-        key = int(scene), *origin.tolist(), *shape.tolist()
+        key = id(view), *origin.tolist(), *shape.tolist()
         renderer = self._renderers.get(key)
         if renderer is None:
             cut = plan.mapping.window(

@@ -30,6 +30,7 @@ class SlotObservation:
     n_elements: of the last rendered slots; n_pixels: of all products so far
     ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
     sky_precision (B, Co): the views', 0 where they have none
+    origin (B, 2) [px]: first pixel of those that are here among the views' own, see `cut`
     root (B, Co, My, Mx): on the device, as are data, residual and weight, and, in `_errors`, the
         scale times each error of the light so far
     """
@@ -37,18 +38,38 @@ class SlotObservation:
     def __init__(self, views, channels, device, dtype, tuning, precision: Precision, tolerance):
         self.views, self.channels, self.device, self.dtype = views, channels, device, dtype
         self.tuning = tuning
-        shape = self.n_bands, self.my, self.mx = views[0].sqrt_weights.shape
-        shape = len(views), *shape
+        self.n_bands, self.my, self.mx = views[0].sqrt_weights.shape
         self.root = device.resident.stack([v.sqrt_weights for v in views], dtype)
         self.data = device.resident.stack([v.data for v in views], dtype)
-        self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
-        self.sums = device.empty((*shape[:3], 3), dtype)
+        self._reserve()
         self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
         known = [v.sky_precision for v in views]
-        self.sky_precision = np.zeros(shape[:2]) if known[0] is None else np.array(known)
+        self.sky_precision = np.zeros(self.root.shape[:2]) if known[0] is None else np.array(known)
         self.aim = RenderPlanner(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
-        self._errors: dict = {}
+        self.origin, self._errors = np.zeros((len(views), 2), int), {}
+
+    def _reserve(self):
+        """Reserves memory for residuals and weights."""
+        self.residual, self.weight = (
+            self.device.empty(self.root.shape, self.dtype) for _ in range(2)
+        )
+        self.sums = self.device.empty((*self.root.shape[:3], 3), self.dtype)
+
+    def cut(self, scenes, low, size) -> SlotObservation:
+        """Windows of scenes (k,), which may repeat, as scenes of their own.
+
+        low (k, 2), size (2,) [px]: first pixels and size of the windows, which lie inside
+        """
+        out, given = copy(self), self.device.get_all([self.root, self.data, self._light])
+        rows = [(b, slice(None), *box_slices(at, size)) for b, at in zip(scenes, low, strict=True)]
+        cuts = (self.device.put(np.array([values[row] for row in rows])) for values in given)
+        out.root, out.data, out._light = cuts
+        out.views, out.origin, (out.my, out.mx) = [self.views[b] for b in scenes], low, size
+        out.scale, out.sky_precision = self.scale[scenes], self.sky_precision[scenes]
+        out.aim, out._errors = self.aim.of_scenes(scenes), {}
+        out._reserve()
+        return out
 
     @cached_property
     def _light(self):
@@ -79,6 +100,8 @@ class SlotObservation:
             if run.renderer is not None:
                 size[part] = run.renderer.size
                 runs.append(run)
+        low -= self.origin[slots.scene]
+        self.lit[:, :2] -= self.origin[slots.scene]
         begin, n = cumulative_offsets(slots.n_images * self.n_bands * size.prod(axis=1))
         self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
         self.place_on_device = self.device.put(self.place.astype(np.int32))

@@ -15,11 +15,10 @@ the fluxes f hold the changes to the other ends, whose chi2 is worse by Delta (p
 
 from __future__ import annotations
 
-from itertools import zip_longest
-
 import numpy as np
 from scipy.special import expit
 
+from ..linear.spectra import portions
 from ..profiles import GalaxyProfile, galaxy_reach
 from .first_profiles import NEED
 from .shape_grid import part_inside
@@ -29,73 +28,89 @@ from .shape_grid import part_inside
 # none is silently wrong (bench.ladder, close, seed 52525); of 200 without further starts 18 are.
 MAX_AWAY, MIN_RATIO, RADIUS_LEVEL = 0.5, 1.5, 0.1
 N_ENDS = 3  # before, of both profiles, with one of them held
+# Side of the windows in which pairs are fitted, in that of their light before, which may widen.
+MARGIN = 1.5
+BYTES_A_PIXEL = 20  # of root, data, light, residual and weight
 
 
 def run_from_equal_profiles(fit, scenes):
     """Fits close pairs in scenes (k,) of a ProfileFit again; the best end of each stays.
 
-    Steps that end where they gain NEED cannot compare ends: fits of such a tolerance have no others.
+    Steps that end where they gain NEED cannot compare ends: fits of such a tolerance have no other.
     """
-    groups = {b: _groups(_larger_neighbours(fit, b)) for b in scenes if fit.tol < NEED}
-    scenes = np.array([b for b, own in groups.items() if own], int)
-    if not len(scenes):
+    groups = [g for b in scenes if fit.tol < NEED for g in _groups(_larger_neighbours(fit, b))]
+    if not groups:
         return
-    before, chi2, doubts, moved = fit._copy(), fit._chi2_as_expected(scenes), [], {}
+    scenes = np.unique([fit.looking.scene[min(own)] for own in groups])
+    before, chi2, moved = fit._copy(), fit._chi2_as_expected(scenes), []
     fit._look(scenes, fit.theta, slopes=False)
     rest = fit.looking.without_light(fit.looking.spectra)
-    for some in zip_longest(*groups.values(), fillvalue={}):
-        chosen, best, doubt = _best_ends(fit, rest, {i: j for own in some for i, j in own.items()})
-        moved |= best
-        doubts.append(np.zeros((*fit.looking.spectra.shape, N_ENDS)))
-        doubts[-1][chosen] = doubt
-    fit.flux_doubt = np.concatenate(doubts, axis=2)
-    for i, (theta, spectrum) in moved.items():
-        at = fit.looking.scene[i], fit.looking.index[i]
-        fit.theta[at], fit.looking.spectra[i], fit.population.contamination[at] = theta, spectrum, 1
-    again = np.unique(fit.looking.scene[list(moved)])
+    windows = [_windows(fit.looking, sight, groups) for sight in rest.sights]
+    fit.flux_doubt = np.zeros((*fit.looking.spectra.shape, N_ENDS * len(groups)))
+    n_pixels = sum(sight.n_bands * np.prod(size) for sight, (_, size) in zip(rest.sights, windows))
+    for some in portions(len(groups), N_ENDS * BYTES_A_PIXEL * n_pixels):
+        cuts = [(np.tile(low[some], (N_ENDS, 1)), size) for low, size in windows]
+        moved += _best_ends(fit, rest, groups[some], cuts, some.start)
+    fit.population.contamination[*np.array(fit.at)[:, moved]] = 1
+    again = np.unique(fit.looking.scene[moved])
     fit._take(again, doubt=False)
     fit._step(again)
     better = fit._chi2_as_expected(scenes) < chi2
     fit._undo(before, np.intersect1d(again, scenes[~better]))
 
 
-def _best_ends(fit, rest, larger):
-    """Fits a group of close pairs in each of some scenes again, all other light held.
+def _best_ends(fit, rest, groups, windows, first):
+    """Fits close pairs to their best ends, all other light held; the components (k,) that moved.
 
-    larger: {component: that from which it starts}; rest: LinearisedScenes without the light of all
-    returns the groups' components (n,); {component: (theta, spectrum)} of those with a better end;
-        and the changes (n, C, N_ENDS) of their fluxes to the other ends
+    Stores the changes of fluxes to the other ends, of the groups from number `first` on.
+
+    rest: LinearisedScenes without any light; windows: of the groups in each observation
     """
-    chosen = np.unique([*larger, *larger.values()])
-    part = fit.part(rest, chosen)
-    looking, at, scenes = part.looking, np.array(part.at), np.unique(part.at[0])
-    small, other = (at[:, np.searchsorted(chosen, list(own))] for own in (larger, larger.values()))
-    looking.spectra[:], looking.sky[:] = fit.looking.spectra[chosen], fit.looking.sky
+    members = [(g, i) for g, own in enumerate(groups) for i in sorted({*own, *own.values()})]
+    group, chosen = np.array(members).T
+    n_all, scene = len(chosen), fit.looking.scene[chosen]
+    of_group = scene[np.searchsorted(group, np.arange(len(groups)))]
+    at_end = np.arange(N_ENDS)[:, None] * len(groups) + group
+    looking = rest.cut(at_end.ravel(), np.tile(chosen, N_ENDS), np.tile(of_group, N_ENDS), windows)
+    part = fit.part(looking, np.tile(chosen, N_ENDS))
+    looking.spectra[:] = fit.looking.spectra[np.tile(chosen, N_ENDS)]
+    every = np.arange(looking.n_scenes)
     part._measure_brightness(part.theta)
-    part._look(scenes, part.theta, slopes=False)
+    part._look(every, part.theta, slopes=False)
     part.looking = looking.without_light(-looking.spectra)  # adds their own to the rest
-    part.chi2[scenes] = part._chi2(scenes, part.theta)
-    before, begun, ends = part._copy(), part.theta[*other], [_end(part, scenes)]
-    for held in (False, True):
-        part._restore(before, scenes)
-        part.theta[*small], part.moves[*small] = begun, not held
-        part._take(scenes, doubt=False)
-        part._step(scenes)
-        ends.append(_end(part, scenes))
-    chi2, theta, spectra, flux = (np.array(own) for own in zip(*ends, strict=True))
-    best = np.argmin(chi2 - fit.tol * (np.arange(N_ENDS) == 0)[:, None], axis=0)
-    weight, row = expit((chi2.min(axis=0) - chi2) / NEED), np.searchsorted(scenes, at[0])
-    n = np.arange(len(chosen))
-    best, change = best[row], flux - flux[best[row], n]
-    moved = {i: (theta[best[k], k], spectra[best[k], k]) for k, i in enumerate(chosen) if best[k]}
-    return chosen, moved, np.moveaxis(np.sqrt(weight[:, row])[..., None] * change, 0, -1)
+    at = np.reshape(part.at, (2, N_ENDS, n_all))
+    small = np.array([i in groups[g] for g, i in members])
+    larger = np.array([members.index((g, groups[g][i])) for g, i in members if i in groups[g]])
+    part.theta[*at[:, 1:, small]] = part.theta[*at[:, 1:, larger]]
+    part.moves[*at[:, -1, small]] = False
+    part._take(every, doubt=False)
+    part._step(every[len(groups) :])
+    chi2 = part._chi2_as_expected(every).reshape(N_ENDS, -1)
+    theta, spectra = part.theta[*at], part.looking.spectra.reshape(N_ENDS, n_all, -1)
+    inside = part_inside(looking.components, theta.reshape(N_ENDS * n_all, -1))
+    flux = spectra * inside.reshape(N_ENDS, n_all, 1)
+    best = np.argmin(chi2 - fit.tol * (np.arange(N_ENDS) == 0)[:, None], axis=0)[group]
+    weight, here = expit((chi2.min(axis=0) - chi2) / NEED), (best, np.arange(n_all))
+    change = np.sqrt(weight[:, group])[..., None] * (flux - flux[here])
+    for k in range(N_ENDS):
+        fit.flux_doubt[chosen, :, N_ENDS * (first + group) + k] = change[k]
+    fit.theta[*np.array(fit.at)[:, chosen]] = theta[here]
+    fit.looking.spectra[chosen] = spectra[here]
+    return chosen[best > 0].tolist()
 
 
-def _end(part, scenes):
-    """Chi2 (k,) of scenes, and theta (n, 4), spectra and fluxes (n, C) of all components of these."""
-    theta, spectra = part.theta[*part.at], part.looking.spectra.copy()
-    inside = part_inside(part.looking.components, theta)
-    return part._chi2_as_expected(scenes), theta, spectra, spectra * inside[:, None]
+def _windows(looking, sight, groups):
+    """First pixels (k, 2) and size (2,) of windows about the light of groups in an observation."""
+    shape, low, high = np.array([sight.my, sight.mx]), [], []
+    lit = np.zeros((len(looking.components), 4), int)
+    lit[looking.at] = sight.lit
+    for own in groups:
+        each = lit[[*own, *own.values()]]
+        low.append(each[:, :2].min(axis=0))
+        high.append((each[:, :2] + each[:, 2:]).max(axis=0))
+    low, high = np.clip(low, 0, shape), np.clip(high, 0, shape)
+    size = np.clip((MARGIN * (high - low).max(axis=0)).astype(int), 1, shape)
+    return np.clip((low + high - size) // 2, 0, shape - size), size
 
 
 def _groups(pairs):

@@ -115,13 +115,13 @@ class ProfileFit:
             self._take_equations(scenes)
 
     def part(self, looking, chosen):
-        """ProfileFit of some components (k,) alone, at their present parameters and expectations.
+        """ProfileFit of components (k,) alone, at their present parameters and expectations.
 
-        looking: LinearisedScenes of these observations
+        looking: LinearisedScenes of these
         """
-        components = renumbered(self.looking.components[i] for i in chosen)
-        part = ProfileFit(looking.with_components(components), self.noise, self.tol)
-        here = tuple(np.array(self.at)[:, chosen])
+        noise = np.ones((looking.n_scenes, looking.n_channels))
+        noise[looking.scene] = self.noise[self.looking.scene[chosen]]
+        part, here = ProfileFit(looking, noise, self.tol), tuple(np.array(self.at)[:, chosen])
         part.theta[part.at] = self.theta[here]
         for name in ("mean", "scatter"):
             getattr(part.population, name)[part.at] = getattr(self.population, name)[here]
@@ -134,7 +134,8 @@ class ProfileFit:
             fitted, others stay as they are
         """
         here = [i for i in thetas if self.looking.scene[i] in scenes]
-        fit = self.part(self.looking, here)
+        part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
+        fit = self.part(part, here)
         for b, k, i in zip(*fit.at, here, strict=True):
             fit.theta[b, k, : len(thetas[i])] = thetas[i]
             fit.moves[b, k] = i in free
