@@ -17,6 +17,7 @@ import os
 import threading
 import warnings
 import weakref
+from itertools import accumulate
 
 import numpy as np
 
@@ -99,7 +100,11 @@ class Device:
         n_bytes = math.prod(shape, start=dtype.itemsize)
         if n_bytes > self.memory:
             raise allocation_error(self, n_bytes)
-        return self._call(pyopencl.array.Array, self.queue, shape, dtype, allocator=self._allocate)
+        steps = accumulate(shape[:0:-1], lambda step, n: step * max(n, 1), initial=dtype.itemsize)
+        # pyopencl's own way for its results: checks of the shape take ten times as long
+        given = {"_size": n_bytes // dtype.itemsize, "_context": self.context, "_queue": self.queue}
+        given |= {"strides": tuple(steps)[::-1][: len(shape)], "allocator": self._allocate}
+        return self._call(pyopencl.array.Array, None, shape, dtype, _fast=True, **given)
 
     def zeros(self, shape, dtype):
         """A pyopencl array (shape) of zeros. Raises DeviceError if it does not fit."""

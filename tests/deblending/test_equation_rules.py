@@ -109,7 +109,8 @@ def posed(monkeypatch):
             SimpleNamespace(scene=b, index=i, number=k) for k, (b, i, *_) in enumerate(PARTS)
         ]
         sights = [Sums(c, k) for k, c in enumerate(CHANNELS)]
-        one = LinearisedScenes(components, sights, N_SCENES, None, None, None, fit_sky=fit_sky)
+        host = SimpleNamespace(put=lambda values, dtype=None: np.asarray(values))
+        one = LinearisedScenes(components, sights, N_SCENES, host, None, None, fit_sky=fit_sky)
         thetas = [np.zeros(n) for _, _, n, *_ in PARTS]
         one.render(scenes, thetas, 10.0 ** np.arange(6), slopes=slopes)
         assert [s.whitened for s in sights] == [1, 1]

@@ -124,8 +124,9 @@ def test_residuals_weights_and_their_sums(build, dtype):
     n_channels = 4
     spectra, sky = rng.normal(size=(len(WINDOWS), n_channels)), rng.normal(size=(2, n_channels))
     spectra[0, 1] = 0
+    on_device = [p.sight.device.put(values, dtype) for values in (spectra, sky)]
     for scenes in (np.array([0, 1]), np.array([1])):
-        sums = p.sight.compute_residuals(scenes, p.slots, spectra, sky, ERROR)
+        sums = p.sight.compute_residuals(scenes, p.slots, *on_device, ERROR)
         residual, weight = build.get(p.sight.residual), build.get(p.sight.weight)
         for row, b in enumerate(scenes):
             model = sky[b, 1:3, None, None] * p.root[b]

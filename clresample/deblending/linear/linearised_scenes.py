@@ -83,6 +83,10 @@ class LinearisedScenes:
         if whiten:
             self.whiten()
 
+    def put(self, values):
+        """Values on the device, in its precision."""
+        return self.device.put(values, self.dtype)
+
     def n_pixels(self) -> np.ndarray:
         """Numbers (B,) of pixels with weight, all channels together."""
         weights = [[view.sqrt_weights for view in sight.views] for sight in self.sights]
@@ -107,7 +111,7 @@ class LinearisedScenes:
 
         chi2 (k,) of the rendered scenes, with the prior of the sky.
         """
-        spectra, sky = self.spectra[self.at], self.sky.copy()
+        spectra, sky = self.put(self.spectra[self.at]), self.put(self.sky)
         self.sums = [
             sight.compute_residuals(self.scenes, self.slots, spectra, sky, error)
             for sight in self.sights
@@ -159,7 +163,7 @@ class LinearisedScenes:
 
         spectra (N, C): of the light
         """
-        given = self.scenes, self.slots, spectra[self.at]
+        given = self.scenes, self.slots, self.put(spectra[self.at])
         out = copy(self)
         out.sights = [sight.without_light(*given) for sight in self.sights]
         return out
@@ -188,13 +192,13 @@ class LinearisedScenes:
 
         sky (B, C); error: part of the light that adds to the noise
         """
-        spectra, sky = np.zeros((len(self.slots), self.n_channels)), np.array(sky)
+        spectra, sky = self.put(np.zeros((len(self.slots), self.n_channels))), self.put(sky)
         right, power = np.zeros((2, len(self.components), self.n_channels))
-        for sight, (table, pairs) in zip(self.sights, self.overlapping_pairs, strict=True):
+        for sight, (table, _) in zip(self.sights, self.overlapping_pairs, strict=True):
             sight.compute_residuals(self.scenes, self.slots, spectra, sky, error)
-            alone = table[:, 0] == table[:, 1]
-            square = sight.gram(pairs, 1)[alone][..., 0, 0]
-            power[self.at[table[alone, 0]], sight.channels] = square
+            alone = table[table[:, 0] == table[:, 1]].astype(np.int32)
+            square = sight.gram(self.device.put(alone), 1)[..., 0, 0]
+            power[self.at[alone[:, 0]], sight.channels] = square
             right[self.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0]
         if self.ties is not None:
             right, power = (self.ties.spread(self.ties.total(a)) for a in (right, power))

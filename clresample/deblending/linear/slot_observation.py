@@ -140,15 +140,12 @@ class SlotObservation:
 
         Also returns sums (k, Co, 3) over the pixels.
 
-        spectra (slots, C), sky (B, C): of the model, uploaded once for all observations; error:
-        part of the light that adds to the noise
+        spectra (slots, C), sky (B, C): of the model, on the device; error: part of the light that
+        adds to the noise
         """
         scenes_on_device, first, listed = slots.lists(self.device, scenes)
         if error not in self._errors:
             self._errors[error] = self.device.put(error * self.scale, self.dtype)
-        spectra_on_device, sky = (
-            self.device.resident.stack([values], self.dtype) for values in (spectra, sky)
-        )
         group = self.tuning.sum_group
         self._launch(
             "compute_residuals",
@@ -161,7 +158,7 @@ class SlotObservation:
             channel=self.channels.start,
             n_channels=spectra.shape[1],
             error=self._errors[error],
-            spectra=spectra_on_device,
+            spectra=spectra,
             sky=sky,
             root=self.root,
             data=self.data,
@@ -176,9 +173,9 @@ class SlotObservation:
     def without_light(self, scenes, slots, spectra) -> SlotObservation:
         """This observation without the slots' light in the data of scenes (k,).
 
-        spectra (slots, C): of the light
+        spectra (slots, C): of the light, on the device
         """
-        sky = np.zeros((len(self.views), spectra.shape[1]))
+        sky = self.device.zeros((len(self.views), spectra.shape[1]), self.dtype)
         self.compute_residuals(scenes, slots, spectra, sky, 0.0)
         data, root, rest = self.device.get_all([self.data, self.root, self.residual])
         seen = np.isin(np.arange(len(root)), scenes)[:, None, None, None] & (root > 0)
