@@ -7,8 +7,11 @@ from helpers.scenes import blend
 from clresample import Settings
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.fit import Fit, start_fits
+from clresample.deblending.linear.spectra import MODEL_ERROR
+from clresample.deblending.start import close_pairs
 from clresample.deblending.start.close_pairs import _larger_neighbours, run_from_equal_profiles
 from clresample.deblending.start.profile_fit import ProfileFit
+from clresample.fields.execution.fitting import ROUGH_TOL
 
 FLUX = np.array((3000.0, 2500, 2100))
 SMALL, LARGE = (np.log(1.5), 0, 0, np.log(6.5)), (np.log(7.5), 0.2, -0.1, np.log(5.0))
@@ -72,6 +75,64 @@ def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, mo
     changes = np.moveaxis(doubt, 1, 0) * unit[:, None, None]
     added = known.errors.flux - other.errors.flux
     np.testing.assert_allclose(added, changes @ changes.swapaxes(1, 2), rtol=1e-3)
+
+
+def test_pairs_have_ends_of_their_own(device, monkeypatch):
+    """One does not change with another one of the scene, and errors are of each alone."""
+    doubts, sizes = [], []
+
+    def run(fit):
+        fit.theta[0, :2] = SMALL, LARGE
+        fit.theta[0, 2:, 0] = np.log([4.0, 1.5])
+        fit._take(SCENES)
+        fit._step(SCENES)
+        before = fit._copy()
+        for pairs in ([(3, 2)], [(0, 1), (3, 2)]):
+            fit._restore(before, SCENES)
+            monkeypatch.setattr(close_pairs, "_larger_neighbours", lambda *_, own=pairs: own)
+            run_from_equal_profiles(fit, SCENES)
+            doubts.append(fit.flux_doubt)
+            sizes.append(fit.theta[0, :, 0].copy())
+
+    monkeypatch.setattr(ProfileFit, "run", run)
+    flux = tuple(0.1 * FLUX)
+    rows = [((22, 22), flux, 6.0), ((22.6, 22.8), flux, 6.0)]
+    rows += [((66, 66), flux, 4.0), ((68, 66.5), flux, 1.5)]
+    start_fits([Fit(blend(rows, shape=(88, 88), seed=6), Settings(), device, np.float32, pad=1)])
+    (alone, both), ((size, _), (other, _)) = doubts, np.array(sizes)[:, :2]
+    assert abs(size - np.log(6)) > 0.2 > abs(other - np.log(6))  # only where it is a pair
+    np.testing.assert_allclose(both[2:, :, 3:], alone[2:], atol=1e-3 * np.abs(alone).max())
+    assert both[:2, :, :3].any() and alone[2:].any()
+    assert not both[:2, :, 3:].any() and not both[2:, :, :3].any() and not alone[:2].any()
+
+
+def test_a_window_of_a_scene_with_held_light(device, spoilt):
+    """Has the pixels of the whole scene there, with one galaxy's light and without the other's."""
+    start_fits([Fit(pair(1.0), Settings(), device, np.float32, pad=1)])
+    (fit,), one = spoilt, np.zeros(1, int)
+    fit._look(SCENES, fit.theta, slopes=False)
+    fit.looking.solve(MODEL_ERROR)
+    chi2, sights = fit.looking.compute_residuals(MODEL_ERROR), fit.looking.sights
+    found = [(device.get(s.residual), device.get(s.weight)) for s in sights]
+    low = [np.array([[s.my // 3, s.mx // 5]]) for s in sights]
+    size = [np.array([s.my // 2, s.mx // 3]) for s in sights]
+    rest = fit.looking.without_light(fit.looking.spectra * [[0], [1]])
+    cut = rest.cut(one, one, one, list(zip(low, size, strict=True)))
+    cut.spectra[:] = fit.looking.spectra[:1]
+    cut.render(SCENES, [fit.theta[0, 0]], fit.brightness[:1], slopes=False)
+    own, wanted = cut.compute_residuals(MODEL_ERROR), 0.0
+    for sight, (residual, weight), a, n in zip(cut.sights, found, low, size, strict=True):
+        inside = (0, slice(None), *(slice(k, k + m) for k, m in zip(a[0], n, strict=True)))
+        np.testing.assert_allclose(device.get(sight.residual)[0], residual[inside], atol=2e-3)
+        wanted += (weight[inside] * residual[inside] ** 2).sum()
+    np.testing.assert_allclose(own, wanted, rtol=1e-4)
+    assert 5 < own < 0.5 * chi2
+
+
+def test_rough_fits_have_no_further_starts(device, spoilt):
+    settings = Settings(loss_tol=ROUGH_TOL)
+    start_fits([Fit(pair(1.0), settings, device, np.float32, pad=1)])
+    assert spoilt[0].flux_doubt.shape[2] == 0
 
 
 @pytest.mark.parametrize("doubt, found", [((9.0, 200.0), [(1, 0)]), ((1.0, 2.0), [])])

@@ -49,7 +49,8 @@ def run_from_equal_profiles(fit, scenes):
     rest = fit.looking.without_light(fit.looking.spectra)
     windows = [_windows(fit.looking, sight, groups) for sight in rest.sights]
     fit.flux_doubt = np.zeros((*fit.looking.spectra.shape, N_ENDS * len(groups)))
-    n_pixels = sum(sight.n_bands * np.prod(size) for sight, (_, size) in zip(rest.sights, windows))
+    pairs = zip(rest.sights, windows, strict=True)
+    n_pixels = sum(sight.n_bands * int(np.prod(size)) for sight, (_, size) in pairs)
     for some in portions(len(groups), N_ENDS * BYTES_A_PIXEL * n_pixels):
         cuts = [(np.tile(low[some], (N_ENDS, 1)), size) for low, size in windows]
         moved += _best_ends(fit, rest, groups[some], cuts, some.start)
@@ -96,9 +97,10 @@ def _best_ends(fit, rest, groups, windows, first):
     change = np.sqrt(weight[:, group])[..., None] * (flux - flux[here])
     for k in range(N_ENDS):
         fit.flux_doubt[chosen, :, N_ENDS * (first + group) + k] = change[k]
-    fit.theta[*np.array(fit.at)[:, chosen]] = theta[here]
-    fit.looking.spectra[chosen] = spectra[here]
-    return chosen[best > 0].tolist()
+    moved = best > 0
+    fit.theta[*np.array(fit.at)[:, chosen[moved]]] = theta[here][moved]
+    fit.looking.spectra[chosen[moved]] = spectra[here][moved]
+    return chosen[moved].tolist()
 
 
 def _windows(looking, sight, groups):

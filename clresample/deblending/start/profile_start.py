@@ -190,7 +190,7 @@ def _point(patch, fit, thetas, sources, b, dark):
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
         flux_scatter=scatter,
-        flux_doubt=doubt,
+        flux_doubt=doubt[..., doubt.any(axis=(0, 1))],
     )
 
 
