@@ -47,7 +47,8 @@ class SlotObservation:
         self.sky_precision = np.zeros(self.root.shape[:2]) if known[0] is None else np.array(known)
         self.aim = RenderPlanner(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
-        self.origin, self._errors = np.zeros((len(views), 2), int), {}
+        self.origin = np.zeros((len(views), 2), int)
+        self._errors: dict = {}
 
     def _reserve(self):
         """Reserves memory for residuals and weights."""

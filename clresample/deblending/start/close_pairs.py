@@ -74,9 +74,10 @@ def _best_ends(fit, rest, groups, windows, first):
     n_all, scene = len(chosen), fit.looking.scene[chosen]
     of_group = scene[np.searchsorted(group, np.arange(len(groups)))]
     at_end = np.arange(N_ENDS)[:, None] * len(groups) + group
-    looking = rest.cut(at_end.ravel(), np.tile(chosen, N_ENDS), np.tile(of_group, N_ENDS), windows)
-    part = fit.part(looking, np.tile(chosen, N_ENDS))
-    looking.spectra[:] = fit.looking.spectra[np.tile(chosen, N_ENDS)]
+    each, scenes = np.tile(chosen, N_ENDS), np.tile(of_group, N_ENDS)
+    looking = rest.cut(at_end.ravel(), each, scenes, windows)
+    part = fit.part(looking, each, fit.noise[scenes])
+    looking.spectra[:] = fit.looking.spectra[each]
     every = np.arange(looking.n_scenes)
     part._measure_brightness(part.theta)
     part._look(every, part.theta, slopes=False)

@@ -114,17 +114,12 @@ class ProfileFit:
             self.looking.compute_residuals(MODEL_ERROR)
             self._take_equations(scenes)
 
-    def part(self, looking, chosen):
-        """ProfileFit of components (k,) alone, at their present parameters and expectations.
-
-        looking: LinearisedScenes of these
-        """
-        noise = np.ones((looking.n_scenes, looking.n_channels))
-        noise[looking.scene] = self.noise[self.looking.scene[chosen]]
+    def part(self, looking, chosen, noise):
+        """ProfileFit of components (k,), those of `looking`, with the noise of its scenes."""
         part, here = ProfileFit(looking, noise, self.tol), tuple(np.array(self.at)[:, chosen])
         part.theta[part.at] = self.theta[here]
-        for name in ("mean", "scatter"):
-            getattr(part.population, name)[part.at] = getattr(self.population, name)[here]
+        part.population.mean[part.at] = self.population.mean[here]
+        part.population.scatter[part.at] = self.population.scatter[here]
         return part
 
     def fit_part(self, thetas, free, scenes):
@@ -135,7 +130,7 @@ class ProfileFit:
         """
         here = [i for i in thetas if self.looking.scene[i] in scenes]
         part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
-        fit = self.part(part, here)
+        fit = self.part(part, here, self.noise)
         for b, k, i in zip(*fit.at, here, strict=True):
             fit.theta[b, k, : len(thetas[i])] = thetas[i]
             fit.moves[b, k] = i in free
