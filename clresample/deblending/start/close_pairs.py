@@ -30,8 +30,6 @@ MAX_AWAY, MIN_RATIO, RADIUS_LEVEL = 0.5, 1.5, 0.1
 N_ENDS = 3  # before, of both profiles, with one of them held
 # Side of the windows in which pairs are fitted, in that of their light before, which may widen.
 MARGIN = 1.5
-# Gain in chi2 below which steps to ends stop: differences of that size change w by a twentieth.
-END_TOL = NEED / 5
 BYTES_A_PIXEL = 20  # of root, data, light, residual and weight
 
 
@@ -88,7 +86,7 @@ def _best_ends(fit, rest, groups, windows, first):
     part.theta[*at[:, 1:, small]] = part.theta[*at[:, 1:, larger]]
     part.moves[*at[:, -1, small]] = False
     part._take(every, doubt=False)
-    part._step(every[len(groups) :], tol=max(END_TOL, fit.tol))
+    part._step(every[len(groups) :])
     chi2 = part._chi2_as_expected(every).reshape(N_ENDS, -1)
     theta, spectra = part.theta[*at], part.looking.spectra.reshape(N_ENDS, n_all, -1)
     inside = part_inside(looking.components, theta.reshape(N_ENDS * n_all, -1))
