@@ -122,7 +122,7 @@ class AlignedObservation:
         return self.n_threads if images.size > MIN_THREADED_ELEMENTS else 1
 
     def observe(self, images, i, origin, low, high, pixel=1):
-        """Whitened images (k, C, ry, rx) of component i's images (k, ny, nx) in a box.
+        """Whitened images (C, k, ry, rx) of component i's images (k, ny, nx) in a box.
 
         The box begins at `origin` of the frame; rows and columns from `low` to `high`; float32, as
         the images are.
@@ -149,7 +149,7 @@ class AlignedObservation:
         to_y = np.concatenate([to_y.real, to_y.imag])
         from_y = np.concatenate([from_y.real, -from_y.imag], axis=1)
         root = self.sqrt_weights[:, low[0] : high[0], low[1] : high[1]]
-        out, n = np.empty((k, *root.shape), np.float32), max(CACHED // d.size, 1)
+        out, n = np.empty((len(root), k, *root.shape[1:]), np.float32), max(CACHED // d.size, 1)
 
         def observe_from(first):
             some = images[first : first + n]
@@ -158,8 +158,8 @@ class AlignedObservation:
             z = z.reshape(len(nu_y), len(some), 1, -1) * d[:, None]
             z = (z.reshape(-1, len(nu_x)) @ from_x).reshape(len(nu_y), -1)
             seen = from_y @ np.concatenate([z.real, z.imag])
-            seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(1, 2, 0, 3)
-            np.multiply(seen, root, out=out[first : first + n])
+            seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(2, 1, 0, 3)
+            np.multiply(seen, root[:, None], out=out[:, first : first + n])
 
         map_threads(self.threads_for(images), observe_from, range(0, k, n))
         return out
