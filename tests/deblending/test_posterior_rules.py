@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import scenes
 
-from clresample.deblending.linear.normal import UnknownLayout, _by_channel
+from clresample.deblending.linear.normal import UnknownLayout
 from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.errors import PosteriorSampler
 from clresample.deblending.posterior.modes import STRENGTH, Solution, clipped_power
@@ -311,13 +311,6 @@ def test_the_bound_holds_modes_where_there_is_no_light():
     wanted = (images[:, :5] * pulls[0][:5]).sum((1, 2))
     np.testing.assert_allclose(one._held(0, images), wanted, rtol=1e-12)
     assert one._held(1, images).tolist() == [0, 0, 0]
-
-
-def test_products_with_each_channel():
-    rng = np.random.default_rng(0)
-    light, unit = rng.normal(size=(3, 2 * 5)), rng.normal(size=(2, 5))
-    wanted = np.einsum("kcp,cp->kc", light.reshape(3, 2, 5), unit)
-    np.testing.assert_allclose(_by_channel(light, unit), wanted)
 
 
 def test_draws_are_numbers_times_modes_and_spectra_in_counts():

@@ -149,7 +149,7 @@ class Solution:
         n_own, smooth = 0, None
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
-            least = min(MIN_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
+            least = min(MIN_LIGHT, FAINTEST / max(self._peaks[i], 1e-30))
             given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
             bumps = SmoothModes(*given, least_light=least, in_cells=True)
             change = self.flux_change_sigma(i, bumps.images, bumps.pixel)
@@ -213,12 +213,13 @@ class Solution:
         here, there = intersect_boxes(
             self.scene.origin[i], out.shape, self.scene.origin[j], profile.shape
         )
-        out[here] = self._peak(j) * profile[there]
+        out[here] = self._peaks[j] * profile[there]
         return out
 
-    def _peak(self, i):
-        """Expected light of component i where its profile is 1, channels in quadrature [noise]."""
-        return np.linalg.norm(self.spectra[i]) / self.peaks[i]
+    @cached_property
+    def _peaks(self):
+        """Expected light (n,) where profiles are 1, all channels in quadrature [noise]."""
+        return np.linalg.norm(self.spectra, axis=1) / self.peaks
 
     @cached_property
     def _boxes(self):

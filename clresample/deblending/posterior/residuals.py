@@ -108,7 +108,9 @@ def max_filtered_residuals(result, i_observation):
 
 def _scatter(values):
     """Robust scatter, 1 or more, of values (n,) of the sky."""
-    return max(1.0, np.median(np.abs(values)) / HALF_WIDTH)
+    middle = (len(values) - 1) // 2, len(values) // 2
+    size = np.partition(np.abs(values), middle)  # half the time of np.median
+    return max(1.0, size[list(middle)].mean() / HALF_WIDTH)
 
 
 def fine_scatter(image, used):
