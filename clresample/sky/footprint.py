@@ -93,6 +93,7 @@ def unobserved(footprints, shape) -> np.ndarray:
     for footprint in footprints:
         held, (n, m) = footprint.look(points)
         seen |= held & (footprint.observation.weights > 0).any(axis=0)[n, m]
-    blind = np.pad(~seen, 1, constant_values=True)
     ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
-    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=blind)
+    if seen.all():
+        return ring
+    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=np.pad(~seen, 1, constant_values=True))
