@@ -153,9 +153,9 @@ class AlignedObservation:
         def observe_from(first):
             some = images[first : first + n]
             z = to_y @ some.transpose(1, 0, 2).reshape(m_y, -1)  # (2 Hy, k nx)
-            complex_z = np.empty((len(nu_y), z.shape[1]), np.complex64)
-            complex_z.real, complex_z.imag = np.split(z, 2)
-            z = complex_z.reshape(-1, m_x) @ to_x
+            both = np.empty((len(nu_y), z.shape[1]), np.complex64)
+            both.real, both.imag = z[: len(nu_y)], z[len(nu_y) :]
+            z = both.reshape(-1, m_x) @ to_x
             z = z.reshape(len(nu_y), len(some), 1, -1) * d[:, None]
             z = (z.reshape(-1, len(nu_x)) @ from_x).reshape(len(nu_y), -1)
             seen = from_y @ np.concatenate([z.real, z.imag])

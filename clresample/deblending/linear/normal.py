@@ -278,7 +278,7 @@ class _NormalAccumulator:
         """The products of a component with a level of 1 in each channel."""
         level = self._in_cells(one.cell).sqrt_weights[:, *box_slices(one.low, one.high - one.low)]
         products = one.within(one.low, one.high) @ level.reshape(len(level), -1, 1)
-        unit, light = np.split(products[..., 0].T, [one.u])
+        unit, light = products[:, : one.u, 0].T, products[:, one.u :, 0].T
         at = np.arange(self.channels.start, self.channels.stop)
         side = self.matrix.block(one.i, self.layout.common)
         side[one.modes, at] += light[: one.k]

@@ -123,8 +123,9 @@ class Solution:
         unlike = self.structure_excess(i)
         out = self.findings.strengths[i] * clipped_power(unlike, STRENGTH_EXPONENT)
         out[self._scale] = unlike * STRENGTH
-        others = [self._light(j, i) for j in self._beside(i) if self.source[j] != self.source[i]]
-        return out * overlap_inflation(self._light(i, i), sum(others))
+        own, beside = self._lights(i)
+        others = [light for j, light in beside if self.source[j] != self.source[i]]
+        return out * overlap_inflation(own, sum(others))
 
     def modes(self, i):
         """Images, float32, of component i's morphology and of its modes.
@@ -231,18 +232,26 @@ class Solution:
 
         The other source exceeds `ratio` times source i there.
         """
-        own = self._light(i, i)
+        own, beside = self._lights(i)
         shared = np.zeros(own.shape, bool)
-        for j in self._beside(i):
-            other = self._light(j, i)
+        for _, other in beside:
             shared |= (other > ratio * own) & (other > faint) & (own > faint)
         return shared
 
-    def _beside(self, i):
-        """Other components whose boxes overlap component i's."""
-        low, high = self._boxes
-        meet = ((low < high[i]) & (high > low[i])).all(1)
-        return [j for j in np.flatnonzero(meet) if j != i]
+    @cached_property
+    def _last_lights(self):
+        """{i: lights} of the component for which `_lights` was called last."""
+        return {}
+
+    def _lights(self, i):
+        """Expected light on component i's box, `_light`: its own; and [(j, light)] of others there."""
+        if i not in self._last_lights:
+            low, high = self._boxes
+            meet = np.flatnonzero(((low < high[i]) & (high > low[i])).all(1))
+            beside = [(j, self._light(j, i)) for j in meet if j != i]
+            self._last_lights.clear()
+            self._last_lights[i] = self._light(i, i), beside
+        return self._last_lights[i]
 
 
 def _combine(images, keep, weights, out):

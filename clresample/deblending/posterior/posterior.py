@@ -179,8 +179,8 @@ class Posterior:
             by_sums = moment_derivatives(sum(one[:, 0] for one in sums))
             rows = []
             for one, part in zip(sums, light, strict=True):
-                by_light, by_mode = np.split(by_sums @ one, [1], axis=1)
-                rows.append(np.concatenate([by_mode, by_light / part * by_band], axis=1))
+                slopes = by_sums @ one
+                rows.append(np.concatenate([slopes[:, 1:], slopes[:, :1] / part * by_band], axis=1))
             covariance = np.zeros((5, 5))
             for a, i in enumerate(own):
                 for b, j in enumerate(own):
