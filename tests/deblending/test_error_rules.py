@@ -15,7 +15,6 @@ from clresample.deblending.linear.block_matrix import BlockMatrix
 from clresample.deblending.linear.normal import UnknownLayout
 from clresample.deblending.posterior import posterior as posterior_module
 from clresample.deblending.posterior.posterior import FAR_ERROR, Posterior
-from clresample.deblending.posterior.profile_modes import OutsideBoxMoments
 from clresample.deblending.result import Component
 from clresample.deblending.settings import Settings
 from clresample.measurement.shapes import moments
@@ -192,7 +191,7 @@ def made_up(rng, *, fixed=(), n_common=2):
     made = object.__new__(Posterior)
     made.modes = [rng.normal(size=(k, *size)) for k, size in zip(counts, sizes, strict=True)]
     made.beyond = [
-        OutsideBoxMoments(np.abs(rng.normal(size=6)) + 1, rng.normal(size=(6, k))) for k in counts
+        np.column_stack([np.abs(rng.normal(size=6)) + 1, rng.normal(size=(6, k))]) for k in counts
     ]
     made.layout = UnknownLayout(counts, n_channels, n_sky=n_common)
     nodes = made.layout.sizes
@@ -227,7 +226,7 @@ def shifted(made, values):
     for i, part in enumerate(parts):
         k = len(made.modes[i])
         morph = made.solution.morphs[i] + np.tensordot(part[:k], made.modes[i], 1)
-        far = made.beyond[i].sums + made.beyond[i].slopes @ part[:k]
+        far = made.beyond[i] @ np.append(1, part[:k])
         out.append((morph, far, made.solution.spectra[i] + part[k:]))
     return out
 
@@ -297,7 +296,7 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
         wanted = np.sqrt(np.einsum("kyx,kl,lyx->yx", modes, block, modes))
         np.testing.assert_allclose(errors.morphology[i], wide[OWNER[i]] * wanted, rtol=1e-5)
     assert len(made.inverted) == 1  # when the first one was read, for all
-    np.testing.assert_array_equal(errors.outside_box_moments, [far.sums for far in made.beyond])
+    np.testing.assert_array_equal(errors.outside_box_moments, [far[:, 0] for far in made.beyond])
 
 
 def test_second_moments_of_stars_have_no_error_and_are_not_released():

@@ -131,8 +131,9 @@ class Solution:
         """Images, float32, of component i's morphology and of its modes.
 
         returns images (1 + k, ny, nx) of the morphology and its modes, without smooth ones on wide
-            pixels; its modes (k, ny, nx), an array or ModeImages; its OutsideBoxMoments; and the
-            data's gradient by each mode (k,) from pixels on the bound at 0
+            pixels; its modes (k, ny, nx), an array or ModeImages; `light_sums` (6, 1 + k) of the
+            smooth profile beyond the box, and of its changes by the modes; and the data's gradient
+            by each mode (k,) from pixels on the bound at 0
 
         Under the prior the modes' coefficients are independent with unit variance.
         """
@@ -146,7 +147,7 @@ class Solution:
             radial=clipped_power(self.structure_excess(i), STRENGTH_EXPONENT),
         )
         scatter = scatter / self.peaks[i]
-        far = far.scaled(np.append(1 / self.peaks[i], scatter))
+        far *= np.append(1 / self.peaks[i], scatter)
         n_own, smooth = 0, None
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
@@ -166,8 +167,8 @@ class Solution:
             _combine(bumps.images, keep, own, out[:n_own] if smooth is None else smooth)
         out[n_own:] = flush_faint(scatter[:, None, None] * images)
         modes = out if smooth is None else ModeImages(CellImages(smooth, bumps.pixel), out)
-        far = far.with_gauge(self.along(i, modes) * self.peaks[i])
-        return seen, modes, far, self._held(i, modes)
+        beyond = gauged(far, self.along(i, modes) * self.peaks[i])
+        return seen, modes, beyond, self._held(i, modes)
 
     def remove_profile_part(self, i, images):
         """Subtracts the profile's part from images, in place; returns the parts (k,).
@@ -244,7 +245,7 @@ class Solution:
         return {}
 
     def _lights(self, i):
-        """Expected light on component i's box, `_light`: its own; and [(j, light)] of others there."""
+        """Light (`_light`) on component i's box: its own, and [(j, light)] of others there."""
         if i not in self._last_lights:
             low, high = self._boxes
             meet = np.flatnonzero(((low < high[i]) & (high > low[i])).all(1))
@@ -252,6 +253,17 @@ class Solution:
             self._last_lights.clear()
             self._last_lights[i] = self._light(i, i), beside
         return self._last_lights[i]
+
+
+def gauged(sums, along):
+    """Sums (6, 1 + k) of a profile and its modes, with more modes before these.
+
+    `along` (1 + k + m,) times the profile was subtracted from the modes, those of more too.
+    """
+    more = np.zeros((6, len(along) + 1 - sums.shape[1]))
+    out = np.concatenate([sums[:, :1], more, sums[:, 1:]], axis=1)
+    out[:, 1:] -= np.outer(sums[:, 0], along)
+    return out
 
 
 def _combine(images, keep, weights, out):

@@ -115,7 +115,7 @@ class Posterior:
             spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
             own = spectrum * slope[0, -self.layout.n_spectra]  # its flux
             floor[owner[i]] += flux_error_floor * clipped_power(unlike, FLOOR_EXPONENT) * own
-            far[owner[i]] += FAR_ERROR * spectrum * beyond.sums[0]
+            far[owner[i]] += FAR_ERROR * spectrum * beyond[0, 0]
         for common in (floor, far):  # to all channels of a source
             between[:, np.arange(n_sources), np.arange(n_sources)] += common.T**2
             colour += common[:, :, None] * common[:, None, :]
@@ -130,7 +130,7 @@ class Posterior:
             colour * scale[:, :, None] * scale[:, None],
             moments * wide[:, None, None] ** 2,
             MorphologyErrors(self.draws(owner, residuals, unit)),
-            np.array([far.sums for far in self.beyond]),
+            np.array([far[:, 0] for far in self.beyond]),
             released * unit,
             moved,
             residuals,
@@ -143,11 +143,10 @@ class Posterior:
 
     @cached_property
     def _sums(self):
-        """`light_sums` (6, 1 + k) of each component's morphology and modes, light beyond its box too."""
+        """`light_sums` (6, 1 + k) of each component's morphology and modes, beyond its box too."""
         pairs = zip(self.solution.scene.origin, self.solution.morphs, self.modes, self.beyond)
         return [
-            np.concatenate([light_sums(morph[None], at), light_sums(modes, at)], axis=1)
-            + np.column_stack([far.sums, far.slopes])
+            far + np.concatenate([light_sums(morph[None], at), light_sums(modes, at)], axis=1)
             for at, morph, modes, far in pairs
         ]
 
