@@ -201,10 +201,9 @@ class Solution:
         pixel: of the images, see SmoothModes
         """
         m = self.morphs[i] * self.peaks[i]
-        total = max(m.sum(), 1e-30)
-        y, x = np.indices(m.shape)
-        r2 = (y - (y * m).sum() / total) ** 2 + (x - (x * m).sum() / total) ** 2
-        weight = 1 + r2 / max((r2 * m).sum() / total, 1e-9)
+        sides, total = (m.sum(1), m.sum(0)), max(m.sum(), 1e-30)
+        y2, x2 = (np.square((n := np.arange(len(side))) - n @ side / total) for side in sides)
+        weight = 1 + (y2[:, None] + x2) / max((sides[0] @ y2 + sides[1] @ x2) / total, 1e-9)
         significance = np.linalg.norm(self.spectra[i] / self.fixed_error[i])
         weight = cell_sums(weight.astype(np.float32), pixel)
         return np.abs(sums_with(images, weight[None])[0]) / total * significance

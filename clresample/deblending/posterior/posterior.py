@@ -104,11 +104,13 @@ class Posterior:
         for (i, j), block in self.covariance.items():
             if j == self.layout.common:
                 continue
-            found, s, t = slopes[i] @ block @ slopes[j].T, owner[i], owner[j]
-            between[:, s, t] += np.diag(found)
+            part, s, t = slopes[i] @ block, owner[i], owner[j]
+            by_channel = np.einsum("cu,cu->c", part, slopes[j])
+            between[:, s, t] += by_channel
             if i != j:
-                between[:, t, s] += np.diag(found)
+                between[:, t, s] += by_channel
             if s == t:
+                found = part @ slopes[j].T
                 colour[s] += found if i == j else found + found.T
         floor, far = np.zeros((2, *flux.shape))
         for i, (slope, beyond) in enumerate(zip(slopes, self.beyond, strict=True)):
