@@ -111,9 +111,9 @@ class _ComponentView:
 
     i: its index; modes: slice of its node's unknowns, those of the modes here
     low, high (2,): its window
-    images (C, u + k or u + k + 2, ry, rx): of its morphology alone (u = 1, or 0 beside smooth
-        modes); then, times its spectrum, of its modes, and of its slopes along y and x where a
-        shift is unknown
+    images (C, u + k or u + k + 2, ry, rx): of its morphology alone, u = 1, or 0 beside smooth
+        modes; then, times its spectrum, of its modes, and of its slopes along y and x where a shift
+        is unknown
     cell: of pixels in which its images are, see AlignedObservation
     """
 
