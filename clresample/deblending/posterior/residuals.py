@@ -177,7 +177,8 @@ def _filtered(residual, weights, kernels):
         variance, sums = convolved(np.stack([w, w * residual[c]]), np.stack([kernel**2, kernel]))
         most = variance.max(axis=(1, 2), keepdims=True, initial=0)
         seen = (variance > MIN_WEIGHT * most) & (w > 0)
-        np.divide(1, np.sqrt(variance, where=seen), out=point[c], where=seen)
+        root = np.sqrt(variance, out=np.ones_like(variance), where=seen)
+        np.divide(1, root, out=point[c], where=seen)
         np.multiply(sums, point[c], out=found[c], where=seen)
     return found, point
 
