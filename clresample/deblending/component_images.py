@@ -58,6 +58,8 @@ class ComponentImages:
     def within(self, i, window):
         """Component i's image (Co, ny, nx) on a window (slices y, x) that holds its own."""
         image, start = self.images[i], [part.start for part in window]
+        if tuple(window) == self.window(i):
+            return image
         out = np.zeros((self.shape[1], *(part.stop - part.start for part in window)), self.dtype)
         out[:, *box_slices(self.low[i] - start, image.shape[1:])] = image
         return out

@@ -5,11 +5,15 @@ A table is plain arrays until it becomes one astropy table at the end.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
+
+# Number of names whose definitions are cached: those of a catalogue of 100 channels.
+MAX_NAMES = 1024
 
 
 class ColumnDefinition(NamedTuple):
@@ -76,6 +80,7 @@ PREFIXES = definitions(
 SUFFIXES = {"_err": "error of {}", "_centroid": "{} of the fitted light's centroid"}
 
 
+@functools.lru_cache(maxsize=MAX_NAMES)
 def definition(name) -> ColumnDefinition:
     """The definition of a column; an empty one of a name that no catalogue has."""
     if name in DEFINITIONS:

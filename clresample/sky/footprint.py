@@ -55,15 +55,18 @@ class Footprint:
 
     def contains(self, points) -> np.ndarray:
         """Selects points (..., 2) [model px] on an image's pixel, weighted or not: (...)."""
-        return self._look(points)[0]
+        return self.look(points)[0]
 
     def weighted(self, points) -> np.ndarray:
         """True where the pixel at points (..., 2) [model px] has a weight: (C, ...) bool."""
-        held, (n, m) = self._look(points)
+        held, (n, m) = self.look(points)
         return held & (self.observation.weights > 0)[:, n, m]
 
-    def _look(self, points):
-        """Tests if points lie on the image (...); returns their nearest pixels (2, ...) too."""
+    def look(self, points):
+        """Tests if points (..., 2) [model px] lie on the image; returns their nearest pixels too.
+
+        (...) bool, and (2, ...) int.
+        """
         pixels = np.floor(np.nan_to_num(self.locate(points), nan=-1.0) + 0.5)
         top = np.array(self.mapping.shape_out) - 1
         (y, x), (last_y, last_x) = np.moveaxis(pixels, -1, 0), top
@@ -88,7 +91,9 @@ def unobserved(footprints, shape) -> np.ndarray:
     points = np.stack([*np.indices(shape)], axis=-1)
     seen = np.zeros(shape, dtype=bool)
     for footprint in footprints:
-        seen |= footprint.weighted(points).any(axis=0)
-    blind = np.pad(~seen, 1, constant_values=True)
+        held, (n, m) = footprint.look(points)
+        seen |= held & (footprint.observation.weights > 0).any(axis=0)[n, m]
     ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
-    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=blind)
+    if seen.all():
+        return ring
+    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=np.pad(~seen, 1, constant_values=True))

@@ -33,6 +33,8 @@ from .wcs import (
 )
 from .wcs_interface import Ape14Wcs
 
+LAST: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # see Grid.map_to
+
 
 class Grid(GridDisplay, ABC):
     """Pixels of one image and their positions on the sky.
@@ -156,7 +158,8 @@ class Grid(GridDisplay, ABC):
 
         Both WCS are evaluated and their celestial frames (ICRS, FK5, galactic, ...) converted. A
         and t are fitted where `grid_in` covers this grid; the residuals of the fit decide the
-        geometry.
+        geometry. The last mapping without positions is cached, because a fit and its measurements
+        reuse it.
 
         grid_in: the model's grid; WCS or flat as this one is
         tolerance_px [model px]: largest departure that is ignored
@@ -169,7 +172,13 @@ class Grid(GridDisplay, ABC):
         tolerance = check_number(
             "tolerance_px", tolerance_px, "0 or more", lambda x: 0 <= x < math.inf
         )
-        return self._map_to(grid_in, tolerance)
+        other, known_tolerance, known = LAST.get(self, (lambda: None, None, None))
+        if other() is grid_in and known_tolerance == tolerance:
+            return known
+        mapping = self._map_to(grid_in, tolerance)
+        if mapping.positions is None:
+            LAST[self] = weakref.ref(grid_in), tolerance, mapping
+        return mapping
 
     def check_like(self, other: Grid, name):
         """Raises ValueError, naming the other grid `name`, if only one of the two is flat."""
@@ -241,9 +250,6 @@ class FlatGrid(Grid):
         return matrix, np.linalg.solve(other.jacobian, self.origin - other.origin)
 
 
-LAST: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # see WcsGrid._map_to
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class WcsGrid(Grid):
     """Pixels placed by a celestial WCS.
@@ -294,23 +300,14 @@ class WcsGrid(Grid):
         return self.wcs.deepcopy()
 
     def _map_to(self, grid_in, tolerance_px):
-        """The simplest geometry that agrees with both WCS within tolerance_px.
-
-        The last mapping without positions is cached, because a fit and its measurements reuse it.
-        """
-        other, tolerance, known = LAST.get(self, (lambda: None, None, None))
-        if other() is grid_in and tolerance == tolerance_px:
-            return known
-        mapping = map_positions(
+        """The simplest geometry that agrees with both WCS within tolerance_px."""
+        return map_positions(
             lambda n, m: self.positions_in(grid_in, n, m),
             lambda n, m: grid_in.positions_in(self, n, m),
             grid_in.shape,
             self.shape,
             tolerance_px,
         )
-        if mapping.positions is None:
-            LAST[self] = weakref.ref(grid_in), tolerance_px, mapping
-        return mapping
 
 
 # A Grid, or a WCS of astropy or of another package.

@@ -144,14 +144,14 @@ def test_neighbours_are_those_whose_rows_meet(monkeypatch):
 
     class Watched(_NormalAccumulator):
         def _seen(self, i, images, spectrum, origin, low, high):
-            return SimpleNamespace(i=i, low=low, high=high, light=0, cell=1)
+            return SimpleNamespace(i=i, low=low, high=high, images=0, cell=1)
 
         def _add(self, one, other, *_):
             pairs.append((one.i, other.i))
 
-    monkeypatch.setattr(normal, "_products", lambda one, other: ())
+    monkeypatch.setattr(normal, "_products", lambda one, other: 0)
     exposure = SimpleNamespace(
-        window=lambda at, _: np.array(windows[at]), threads_for=lambda light: 1
+        window=lambda at, _: np.array(windows[at]), threads_for=lambda images: 1
     )
     layout = SimpleNamespace(shift=lambda _: None, n_sky=0, spectra_at=lambda c: c)
     images, spectra = [np.zeros((1, 2, 2))] * 4, np.ones((4, 1))

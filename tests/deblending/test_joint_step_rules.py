@@ -32,8 +32,8 @@ class Shown:
         return np.array([origin, np.add(origin, shape)])
 
     def observe(self, images, _i, origin, low, high):
-        """Images (k, ny, nx) of a box as seen (k, C, ry, rx)."""
-        seen = whole(images, origin)[:, None] * self.sqrt_weights
+        """Images (k, ny, nx) of a box as seen (C, k, ry, rx)."""
+        seen = whole(images, origin) * self.sqrt_weights[:, None]
         return seen[:, :, low[0] : high[0], low[1] : high[1]].astype(np.float32)
 
 

@@ -19,7 +19,7 @@ class Plain:
     `dark` on no pixel."""
 
     def __init__(self, n_channels, seed, dark=3, n_threads=1):
-        self.threads_for = lambda light: n_threads
+        self.threads_for = lambda images: n_threads
         self.sqrt_weights = np.random.default_rng(seed).uniform(0.5, 2, (n_channels, *SHAPE))
         self.dark = dark
 
@@ -31,8 +31,8 @@ class Plain:
         return np.array([low, np.minimum(np.add(origin, shape) + 1, SHAPE)])
 
     def observe(self, images, _i, origin, low, high):
-        """Images (k, ny, nx) of a box as seen (k, C, ry, rx)."""
-        seen = whole(images, origin)[:, None] * self.sqrt_weights
+        """Images (k, ny, nx) of a box as seen (C, k, ry, rx)."""
+        seen = whole(images, origin) * self.sqrt_weights[:, None]
         return seen[:, :, low[0] : high[0], low[1] : high[1]].astype(np.float32)
 
 

@@ -94,7 +94,7 @@ def dense_error(kept, i):
     matrix, n_channels = full_matrix(kept, modes), len(kept.unit)
     at = sum(len(m) + n_channels for m in modes[:i])
     slopes = np.zeros((n_channels, len(matrix)))
-    total = s.morphs[i].sum() + kept.posterior.beyond[i].sums[0]
+    total = s.morphs[i].sum() + kept.posterior.beyond[i][0, 0]
     k = len(modes[i])
     slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].sum((1, 2)) + beyond)
     slopes[:, at + k : at + k + n_channels] = total * np.eye(n_channels)
@@ -121,7 +121,7 @@ def _dense_modes(posterior, i):
     images = np.sqrt(np.maximum(profile, 0)) * root
     along = s.along(i, images)
     far = posterior.beyond[i]
-    beyond = np.concatenate([-far.sums[0] * along, far.slopes[0, -n_slopes:]])
+    beyond = np.concatenate([-far[0, 0] * along, far[0, -n_slopes:]])
     return np.concatenate([images / s.peaks[i], posterior.modes[i][-n_slopes:]]), beyond
 
 

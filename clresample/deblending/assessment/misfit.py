@@ -116,13 +116,13 @@ def _of_channel(rest, c, n_sources, noise):
     """
     used, owner = rest.used[c], rest.owner[c]
 
-    def sums(where, values):
-        own = where & (owner >= 0)
-        found = np.bincount(owner[own], values[own], n_sources)
-        return np.concatenate([found, [found.sum(), values[where].sum()]])
+    def sums(where, values=None):
+        labels = np.where(where, owner + 2, 0).ravel()  # 1: of no source
+        found = np.bincount(labels, values if values is None else values.ravel(), n_sources + 2)
+        return np.concatenate([found[2:], [found[2:].sum(), found[1:].sum()]])
 
     def of_pixels(where):
-        count = sums(where, np.ones(where.shape))
+        count = sums(where)
         with np.errstate(invalid="ignore"):
             chi2 = sums(where, rest.residual[c] ** 2 / noise) / count
         excess = chi2_excess(chi2, count)
@@ -136,12 +136,13 @@ def _of_channel(rest, c, n_sources, noise):
         found, chi2_by_noise = of_pixels(by_noise)
         chi2 = np.where(found > excess, chi2_by_noise, chi2)
         excess = np.fmax(excess, found)
-    size = np.nan_to_num(np.abs(rest.filtered[c]))
+    size = np.abs(rest.filtered[c])  # NaN unseen, as `point`
+    seen = used & np.isfinite(size)
     left = np.where(size > LEFT_SIGMAS, size, 0.0) - LEFT_BY_NOISE
-    seen = used & np.isfinite(rest.filtered[c])
-    light = sums(seen, rest.power[c] * np.nan_to_num(rest.point[c]) * left)
-    points = np.where(size > MISFIT_SIGMAS, size * np.nan_to_num(rest.point[c]), 0.0)
-    np.maximum.at(light, np.where(owner < 0, n_sources + 1, owner)[seen], points[seen])
+    light = sums(seen, rest.power[c] * rest.point[c] * left)
+    points = seen & (size > MISFIT_SIGMAS)
+    at = np.where(owner < 0, n_sources + 1, owner)[points]
+    np.maximum.at(light, at, (size * rest.point[c])[points])
     return excess, chi2, np.maximum(light, 0.0)
 
 

@@ -122,7 +122,7 @@ class AlignedObservation:
         return self.n_threads if images.size > MIN_THREADED_ELEMENTS else 1
 
     def observe(self, images, i, origin, low, high, pixel=1):
-        """Whitened images (k, C, ry, rx) of component i's images (k, ny, nx) in a box.
+        """Whitened images (C, k, ry, rx) of component i's images (k, ny, nx) in a box.
 
         The box begins at `origin` of the frame; rows and columns from `low` to `high`; float32, as
         the images are.
@@ -131,17 +131,16 @@ class AlignedObservation:
         """
         k, m_y, m_x = images.shape
         n_y, n_x = m_y * pixel, m_x * pixel
-        nu_y, nu_x, d = self.transfer.at((n_y, n_x), self.reach_px)
+        nu_y, nu_x, d, to_y, to_x = self.transfer.at((n_y, n_x), self.reach_px)
+        to_y, to_x = to_y[:, :n_y], to_x[:n_x]
         if pixel > 1:  # frequencies that its pixels resolve
             rows, columns = (np.abs(nu) <= 0.5 / pixel for nu in (nu_y, nu_x))
             nu_y, nu_x, d = nu_y[rows], nu_x[columns], d[rows][..., columns]
+            to_y = to_y[rows] @ from_cells(n_y, pixel).astype(np.float32)
+            to_x = from_cells(n_x, pixel).T.astype(np.float32) @ to_x[:, columns]
         if self.coefficients is not None:
             parts = self.coefficients[i]
             d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
-        to_y, to_x = _waves(nu_y, -np.arange(n_y)), _waves(-np.arange(n_x), nu_x)
-        if pixel > 1:
-            to_y = to_y @ from_cells(n_y, pixel).astype(np.float32)
-            to_x = from_cells(n_x, pixel).T.astype(np.float32) @ to_x
         ends = zip(low, high, strict=True)
         rows, columns = (slice(self.cell * a, self.cell * b) for a, b in ends)
         from_y = _waves(self._middles(self.y[rows]) - origin[0], nu_y)
@@ -149,17 +148,19 @@ class AlignedObservation:
         to_y = np.concatenate([to_y.real, to_y.imag])
         from_y = np.concatenate([from_y.real, -from_y.imag], axis=1)
         root = self.sqrt_weights[:, low[0] : high[0], low[1] : high[1]]
-        out, n = np.empty((k, *root.shape), np.float32), max(CACHED // d.size, 1)
+        out, n = np.empty((len(root), k, *root.shape[1:]), np.float32), max(CACHED // d.size, 1)
 
         def observe_from(first):
             some = images[first : first + n]
             z = to_y @ some.transpose(1, 0, 2).reshape(m_y, -1)  # (2 Hy, k nx)
-            z = (z[: len(nu_y)] + 1j * z[len(nu_y) :]).reshape(-1, m_x) @ to_x
+            both = np.empty((len(nu_y), z.shape[1]), np.complex64)
+            both.real, both.imag = z[: len(nu_y)], z[len(nu_y) :]
+            z = both.reshape(-1, m_x) @ to_x
             z = z.reshape(len(nu_y), len(some), 1, -1) * d[:, None]
             z = (z.reshape(-1, len(nu_x)) @ from_x).reshape(len(nu_y), -1)
             seen = from_y @ np.concatenate([z.real, z.imag])
-            seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(1, 2, 0, 3)
-            np.multiply(seen, root, out=out[first : first + n])
+            seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(2, 1, 0, 3)
+            np.multiply(seen, root[:, None], out=out[:, first : first + n])
 
         map_threads(self.threads_for(images), observe_from, range(0, k, n))
         return out
@@ -221,12 +222,15 @@ class BandLimitedTransfer:
     def at(self, shape, reach):
         """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the half-plane's weights.
 
-        The period is long enough that a box does not overlap itself within `reach`.
+        And the waves (Hy, Ny), (Nx, W) that transform images from their first pixel on, of the
+        period or smaller: it is long enough that a box does not overlap itself within `reach`.
         """
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)
         if key not in self._found:
-            self._found[key] = self._band(key, self._edge)
+            nu_y, nu_x, d = self._band(key, self._edge)
+            waves = _waves(nu_y, -np.arange(sides[0])), _waves(-np.arange(sides[1]), nu_x)
+            self._found[key] = nu_y, nu_x, d, *waves
         return self._found[key]
 
     @functools.cached_property

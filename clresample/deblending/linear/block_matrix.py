@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri, dtrtrs
 
 # Added to the unit diagonal of the matrix, so that undetermined unknowns have finite variances.
 RIDGE = 1e-9
@@ -106,7 +106,7 @@ class BlockCholesky:
         place = {node: at for at, node in enumerate(self.order)}
         rest = {}
         for (i, j), block in matrix.items():
-            scaled = block / self.scale[i][:, None] / self.scale[j]
+            scaled = block / np.outer(self.scale[i], self.scale[j])
             if i == j:
                 scaled[np.diag_indices(len(scaled))] += ridge
             late_first = place[i] >= place[j]
@@ -127,7 +127,7 @@ class BlockCholesky:
         if not later:
             return
         stacked = np.concatenate([rest.pop((u, v)) for u in later])
-        self._below[v] = below = solve_triangular(lower, stacked.T, lower=True).T
+        self._below[v] = below = _solve(lower, stacked.T).T
         ends = self._ends(v)
         for a, u in enumerate(later):
             part = below[: ends[a + 1]] @ below[ends[a] : ends[a + 1]].T
@@ -146,7 +146,7 @@ class BlockCholesky:
         """H^-1 of arrays (n), one for each node."""
         parts = [r / s for r, s in zip(right, self.scale, strict=True)]
         for v in self.order:
-            parts[v] = solve_triangular(self._lower[v], parts[v], lower=True)
+            parts[v] = _solve(self._lower[v], parts[v])
             ends = self._ends(v)
             for a, u in enumerate(self._later[v]):
                 parts[u] = parts[u] - self._below[v][ends[a] : ends[a + 1]] @ parts[v]
@@ -164,7 +164,7 @@ class BlockCholesky:
             if self._later[v]:
                 after = np.concatenate([out[u] for u in self._later[v]])
                 right = right - self._below[v].T @ after
-            out[v] = solve_triangular(self._lower[v], right, lower=True, trans=1)
+            out[v] = _solve(self._lower[v], right, transposed=True)
         return [x / s for x, s in zip(out, self.scale, strict=True)]
 
     def inverse(self) -> BlockMatrix:
@@ -180,7 +180,7 @@ class BlockCholesky:
             return found[u, w] if place[u] >= place[w] else found[w, u].T
 
         for v in reversed(self.order):
-            half = solve_triangular(self._lower[v], np.eye(self.sizes[v]), lower=True)
+            half = dtrtri(self._lower[v].T)[0].T
             own, later = half.T @ half, self._later[v]
             if later:
                 step = self._below[v] @ half
@@ -195,8 +195,17 @@ class BlockCholesky:
         for u, v in found:
             i, j = min(u, v), max(u, v)
             values = found[u, v] if u == i else found[u, v].T
-            out.block(i, j)[:] = values / self.scale[i][:, None] / self.scale[j]
+            np.divide(values, np.outer(self.scale[i], self.scale[j]), out=out.block(i, j))
         return out
+
+
+def _solve(lower, right, *, transposed=False):
+    """x of lower x = right, (n,) or (n, r), or of the transposed matrix.
+
+    By LAPACK itself: SciPy's function would copy the matrix and take most of the time of small ones
+    for its checks.
+    """
+    return dtrtrs(lower.T, right, trans=not transposed)[0]
 
 
 def _root(diagonal):

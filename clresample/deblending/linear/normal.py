@@ -111,9 +111,9 @@ class _ComponentView:
 
     i: its index; modes: slice of its node's unknowns, those of the modes here
     low, high (2,): its window
-    light (k or k + 2, C, ry, rx): of its modes, then of its slopes along y and x where a shift is
-        unknown, all times its spectrum; unit (1 or 0, C, ry, rx): of its morphology alone, none
-        beside smooth modes
+    images (C, u + k or u + k + 2, ry, rx): of its morphology alone, u = 1, or 0 beside smooth
+        modes; then, times its spectrum, of its modes, and of its slopes along y and x where a shift
+        is unknown
     cell: of pixels in which its images are, see AlignedObservation
     """
 
@@ -121,8 +121,8 @@ class _ComponentView:
     modes: slice
     low: np.ndarray
     high: np.ndarray
-    light: np.ndarray
-    unit: np.ndarray
+    images: np.ndarray
+    u: int
     cell: int = 1
 
     @property
@@ -132,17 +132,14 @@ class _ComponentView:
 
     @cached_property
     def size(self):
-        """Largest root of the squares' sum of its light."""
-        flat = self.light.reshape(len(self.light), int(np.prod(self.light.shape[1:])))
-        return np.sqrt(np.einsum("kp,kp->k", flat, flat).max(initial=0))
+        """Largest root of the squares' sum of its images times the spectrum."""
+        light = self.images[:, self.u :]
+        return np.sqrt(np.einsum("ckyx,ckyx->k", light, light).max(initial=0))
 
     def within(self, low, high, dtype=np.float32):
-        """light (k, C * P) of a type and unit (1 or 0, C, P) from `low` to `high`."""
-        cut = box_slices(low - self.low, high - low)
-        light, unit = self.light[:, :, *cut].astype(dtype, copy=False), self.unit[:, :, *cut]
-        n_pixels = int(np.prod(high - low))
-        light = light.reshape(len(light), light.shape[1] * n_pixels)
-        return light, unit.reshape(*unit.shape[:2], n_pixels)
+        """Images (C, u + k, P) of a type from `low` to `high`."""
+        cut = self.images[:, :, *box_slices(low - self.low, high - low)]
+        return cut.astype(dtype, copy=False).reshape(*cut.shape[:2], int(np.prod(high - low)))
 
     def in_cells(self, fine, wide):
         """Images on another lattice with the same products with images that are smooth there.
@@ -156,11 +153,11 @@ class _ComponentView:
             for own, cells in zip(zip(self.low, self.high), zip(low, high), strict=True)
         )
         to_y, to_x = to_y.T.astype(np.float32), to_x.astype(np.float32)
-        root = wide.sqrt_weights[:, *box_slices(low, high - low)]
+        root = wide.sqrt_weights[:, None, *box_slices(low, high - low)]
         scale = np.divide(1, root, out=np.zeros_like(root), where=root > 0)
-        own = fine.sqrt_weights[:, *box_slices(self.low, self.high - self.low)]
-        light, unit = (to_y @ (part * own) @ to_x * scale for part in (self.light, self.unit))
-        return replace(self, low=low, high=high, light=light, unit=unit, cell=wide.cell)
+        own = fine.sqrt_weights[:, None, *box_slices(self.low, self.high - self.low)]
+        images = to_y @ (self.images * own) @ to_x * scale
+        return replace(self, low=low, high=high, images=images, cell=wide.cell)
 
 
 class _NormalAccumulator:
@@ -195,11 +192,11 @@ class _NormalAccumulator:
                 near.append(one)
                 both = [(other, one) if other.i <= i else (one, other) for other in near]
                 both = [self._on_one_lattice(*pair) for pair in both]
-                n_threads = self.exposure.threads_for(one.light)
+                n_threads = self.exposure.threads_for(one.images)
                 products = map_threads(n_threads, lambda pair: _products(*pair), both)
                 for pair, found in zip(both, products, strict=True):
                     if found is not None:
-                        self._add(*pair, *found)
+                        self._add(*pair, found)
                 if self.layout.n_sky:
                     self._add_level(one)
         if self.layout.n_sky:
@@ -214,17 +211,15 @@ class _NormalAccumulator:
             padded = np.pad(images[0], 1, mode="edge")
             images = np.concatenate([images, np.array(np.gradient(padded))[:, 1:-1, 1:-1]])
         seen = self.exposure.observe(images, i, origin, low, high)
-        unit, light = seen[:1].copy(), seen[1:]
-        light *= spectrum[:, None, None]
-        return _ComponentView(i, modes, low, high, light, unit)
+        seen[:, 1:] *= spectrum[:, None, None, None]
+        return _ComponentView(i, modes, low, high, seen, 1)
 
     def _seen_smooth(self, i, images, spectrum, origin, shape):
         exposure = self._in_cells(self.exposure.cell_for(images.pixel))
         low, high = exposure.window(origin, shape[1:])
         light = exposure.observe(images.values, i, origin, low, high, images.pixel)
-        light *= spectrum[:, None, None]
-        modes = slice(0, len(images))
-        return _ComponentView(i, modes, low, high, light, light[:0], exposure.cell)
+        light *= spectrum[:, None, None, None]
+        return _ComponentView(i, slice(0, len(images)), low, high, light, 0, exposure.cell)
 
     def _in_cells(self, cell):
         """The observation in cells, made once."""
@@ -242,9 +237,12 @@ class _NormalAccumulator:
             for one in (a, b)
         )
 
-    def _add(self, a, b, modes, by_a, by_b, units):
-        """Adds the products of two components' images, a.i <= b.i, to the matrix."""
-        same = a is b
+    def _add(self, a, b, found):
+        """Adds the products of two components' images, a.i <= b.i, to the matrix; see _products."""
+        modes = found[:, a.u :, b.u :].sum(0, dtype=np.float64)
+        # of the light of each with the morphology of the other in each channel, if it is there
+        by_a, by_b = found[:, : a.u, b.u :].transpose(1, 2, 0), found[:, a.u :, : b.u].T
+        units = found[:, : a.u, : b.u].reshape(len(found), a.u * b.u).T
         if self.sum is not None:
             by_a, by_b, units = (part @ self.sum for part in (by_a, by_b, units))
         block = self.matrix.block(a.i, b.i)
@@ -256,7 +254,7 @@ class _NormalAccumulator:
             block[of_a, b.modes] += unit[: b.k].T
         for unit in units:
             block[of_a, of_b] += unit
-        if a.i == b.i and not same:  # smooth modes of a component, with the rest of it
+        if a.i == b.i and a is not b:  # smooth modes of a component, with the rest of it
             block[b.modes, a.modes] += modes[: a.k, : b.k].T
             for unit in by_a:
                 block[b.modes, of_a] += unit[: b.k]
@@ -265,9 +263,9 @@ class _NormalAccumulator:
         common, slopes = self.layout.common, modes[a.k :, b.k :]
         if slopes.size:
             both = self.matrix.block(common, common)
-            both[np.ix_(self.shift, self.shift)] += slopes if same else slopes + slopes.T
+            both[np.ix_(self.shift, self.shift)] += slopes if a is b else slopes + slopes.T
         sides = [(a, modes[: a.k, b.k :], of_a, by_a[:, b.k :])]
-        if not same:
+        if a is not b:
             sides.append((b, modes[a.k :, : b.k].T, of_b, by_b[:, a.k :]))
         for one, rows, at, units in sides:
             if rows.shape[1]:
@@ -278,51 +276,30 @@ class _NormalAccumulator:
 
     def _add_level(self, one):
         """The products of a component with a level of 1 in each channel."""
-        root = self._in_cells(one.cell).sqrt_weights
-        level = root[:, *box_slices(one.low, one.high - one.low)]
-        level = level.reshape(len(level), -1)
-        light, unit = one.within(one.low, one.high)
-        products = _by_channel(light, level)
+        level = self._in_cells(one.cell).sqrt_weights[:, *box_slices(one.low, one.high - one.low)]
+        products = one.within(one.low, one.high) @ level.reshape(len(level), -1, 1)
+        unit, light = products[:, : one.u, 0].T, products[:, one.u :, 0].T
         at = np.arange(self.channels.start, self.channels.stop)
         side = self.matrix.block(one.i, self.layout.common)
-        side[one.modes, at] += products[: one.k]
-        for image in unit:
-            spectra = self.layout.n_modes[one.i] + self.layout.spectra_at(at)
-            side[spectra, at] += np.einsum("cp,cp->c", image, level, dtype=np.float64)
-        if self.shift is not None and len(products) > one.k:
-            both, found = self.matrix.block(*[self.layout.common] * 2), products[one.k :]
+        side[one.modes, at] += light[: one.k]
+        for sums in unit:
+            side[self.layout.n_modes[one.i] + self.layout.spectra_at(at), at] += sums
+        if self.shift is not None and len(light) > one.k:
+            both, found = self.matrix.block(*[self.layout.common] * 2), light[one.k :]
             both[np.ix_(self.shift, at)] += found
             both[np.ix_(at, self.shift)] += found.T
 
 
 def _products(a, b):
-    """Products of two _ComponentViews where their windows overlap; None without overlap.
+    """Products (C, ua + ka, ub + kb) by channel of two _ComponentViews where their windows overlap.
 
-    They are products of the light of both (ka, kb), of b's light with a's unit and of a's light
-    with b's (u, k, C), and of the units (u, C), u = 1 or, without a unit, 0.
+    None without overlap.
     """
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     if not (high > low).all():
         return None
     dtype = np.float64 if a.size * b.size > LARGE else np.float32
-    light_a, unit_a = a.within(low, high, dtype)
-    same = a is b  # NumPy computes half the products if both factors are the same array
-    light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
-    by_b = _by_units(light_a, unit_b)
-    by_a = by_b if same else _by_units(light_b, unit_a)
-    both = zip(unit_a, unit_b, strict=False)
-    units = [np.einsum("cp,cp->c", *pair, dtype=np.float64) for pair in both]
-    return light_a @ light_b.T, by_a, by_b, np.reshape(units, (len(units), unit_a.shape[1]))
-
-
-def _by_units(light, units):
-    """Products (u, k, C) of light (k, C * P) with each channel of units (u, C, P)."""
-    found = [_by_channel(light, unit) for unit in units]
-    return np.reshape(found, (len(units), len(light), units.shape[1]))
-
-
-def _by_channel(light, unit):
-    """Products (k, C) of light (k, C * P) with each channel of unit (C, P)."""
-    n_channels, size = unit.shape
-    light = light.reshape(len(light), n_channels, size).transpose(1, 0, 2)
-    return (light @ unit[:, :, None].astype(light.dtype))[:, :, 0].T
+    first = a.within(low, high, dtype)
+    # NumPy computes half the products if both factors are the same array
+    second = first if a is b else b.within(low, high, dtype)
+    return first @ second.swapaxes(1, 2)

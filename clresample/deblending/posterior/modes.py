@@ -123,15 +123,17 @@ class Solution:
         unlike = self.structure_excess(i)
         out = self.findings.strengths[i] * clipped_power(unlike, STRENGTH_EXPONENT)
         out[self._scale] = unlike * STRENGTH
-        others = [self._light(j, i) for j in self._beside(i) if self.source[j] != self.source[i]]
-        return out * overlap_inflation(self._light(i, i), sum(others))
+        own, beside = self._lights(i)
+        others = [light for j, light in beside if self.source[j] != self.source[i]]
+        return out * overlap_inflation(own, sum(others))
 
     def modes(self, i):
         """Images, float32, of component i's morphology and of its modes.
 
         returns images (1 + k, ny, nx) of the morphology and its modes, without smooth ones on wide
-            pixels; its modes (k, ny, nx), an array or ModeImages; its OutsideBoxMoments; and the
-            data's gradient by each mode (k,) from pixels on the bound at 0
+            pixels; its modes (k, ny, nx), an array or ModeImages; `light_sums` (6, 1 + k) of the
+            smooth profile beyond the box, and of its changes by the modes; and the data's gradient
+            by each mode (k,) from pixels on the bound at 0
 
         Under the prior the modes' coefficients are independent with unit variance.
         """
@@ -145,11 +147,11 @@ class Solution:
             radial=clipped_power(self.structure_excess(i), STRENGTH_EXPONENT),
         )
         scatter = scatter / self.peaks[i]
-        far = far.scaled(np.append(1 / self.peaks[i], scatter))
+        far *= np.append(1 / self.peaks[i], scatter)
         n_own, smooth = 0, None
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
-            least = min(MIN_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
+            least = min(MIN_LIGHT, FAINTEST / max(self._peaks[i], 1e-30))
             given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
             bumps = SmoothModes(*given, least_light=least, in_cells=True)
             change = self.flux_change_sigma(i, bumps.images, bumps.pixel)
@@ -165,8 +167,8 @@ class Solution:
             _combine(bumps.images, keep, own, out[:n_own] if smooth is None else smooth)
         out[n_own:] = flush_faint(scatter[:, None, None] * images)
         modes = out if smooth is None else ModeImages(CellImages(smooth, bumps.pixel), out)
-        far = far.with_gauge(self.along(i, modes) * self.peaks[i])
-        return seen, modes, far, self._held(i, modes)
+        beyond = gauged(far, self.along(i, modes) * self.peaks[i])
+        return seen, modes, beyond, self._held(i, modes)
 
     def remove_profile_part(self, i, images):
         """Subtracts the profile's part from images, in place; returns the parts (k,).
@@ -199,10 +201,9 @@ class Solution:
         pixel: of the images, see SmoothModes
         """
         m = self.morphs[i] * self.peaks[i]
-        total = max(m.sum(), 1e-30)
-        y, x = np.indices(m.shape)
-        r2 = (y - (y * m).sum() / total) ** 2 + (x - (x * m).sum() / total) ** 2
-        weight = 1 + r2 / max((r2 * m).sum() / total, 1e-9)
+        sides, total = (m.sum(1), m.sum(0)), max(m.sum(), 1e-30)
+        y2, x2 = (np.square((n := np.arange(len(side))) - n @ side / total) for side in sides)
+        weight = 1 + (y2[:, None] + x2) / max((sides[0] @ y2 + sides[1] @ x2) / total, 1e-9)
         significance = np.linalg.norm(self.spectra[i] / self.fixed_error[i])
         weight = cell_sums(weight.astype(np.float32), pixel)
         return np.abs(sums_with(images, weight[None])[0]) / total * significance
@@ -213,12 +214,13 @@ class Solution:
         here, there = intersect_boxes(
             self.scene.origin[i], out.shape, self.scene.origin[j], profile.shape
         )
-        out[here] = self._peak(j) * profile[there]
+        out[here] = self._peaks[j] * profile[there]
         return out
 
-    def _peak(self, i):
-        """Expected light of component i where its profile is 1, channels in quadrature [noise]."""
-        return np.linalg.norm(self.spectra[i]) / self.peaks[i]
+    @cached_property
+    def _peaks(self):
+        """Expected light (n,) where profiles are 1, all channels in quadrature [noise]."""
+        return np.linalg.norm(self.spectra, axis=1) / self.peaks
 
     @cached_property
     def _boxes(self):
@@ -230,18 +232,37 @@ class Solution:
 
         The other source exceeds `ratio` times source i there.
         """
-        own = self._light(i, i)
+        own, beside = self._lights(i)
         shared = np.zeros(own.shape, bool)
-        for j in self._beside(i):
-            other = self._light(j, i)
+        for _, other in beside:
             shared |= (other > ratio * own) & (other > faint) & (own > faint)
         return shared
 
-    def _beside(self, i):
-        """Other components whose boxes overlap component i's."""
-        low, high = self._boxes
-        meet = ((low < high[i]) & (high > low[i])).all(1)
-        return [j for j in np.flatnonzero(meet) if j != i]
+    @cached_property
+    def _last_lights(self):
+        """{i: lights} of the component for which `_lights` was called last."""
+        return {}
+
+    def _lights(self, i):
+        """Light (`_light`) on component i's box: its own, and [(j, light)] of others there."""
+        if i not in self._last_lights:
+            low, high = self._boxes
+            meet = np.flatnonzero(((low < high[i]) & (high > low[i])).all(1))
+            beside = [(j, self._light(j, i)) for j in meet if j != i]
+            self._last_lights.clear()
+            self._last_lights[i] = self._light(i, i), beside
+        return self._last_lights[i]
+
+
+def gauged(sums, along):
+    """Sums (6, 1 + k) of a profile and its modes, with more modes before these.
+
+    `along` (1 + k + m,) times the profile was subtracted from the modes, those of more too.
+    """
+    more = np.zeros((6, len(along) + 1 - sums.shape[1]))
+    out = np.concatenate([sums[:, :1], more, sums[:, 1:]], axis=1)
+    out[:, 1:] -= np.outer(sums[:, 0], along)
+    return out
 
 
 def _combine(images, keep, weights, out):

@@ -1,38 +1,34 @@
-"""Derivatives of centroids and second moments with respect to morphology pixels."""
+"""Sums from which light, centroids and second moments follow, and the derivatives of these."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ..linear.mode_images import sums_with
 
-def moment_derivatives(origins, morphs, light, beyond=None):
-    """Slopes of (y, x, yy, yx, xx) of I = sum_i light_i S_i by the pixels of each S_i / light_i.
 
-    origins (k, 2) [px], morphs (k): arrays (ny, nx); light (k,), any unit
-    beyond (k, 6): sums over what lies beyond the boxes, see OutsideBoxMoments; None: nothing
-    returns k arrays (5, ny, nx), and (5, 6), by the sums over what lies beyond
+def light_sums(images, origin):
+    """Sums (6, k) of images (k, ny, nx), ModeImages or array, times 1, y, x, y y, y x, x x.
+
+    origin (2,) [frame px]: of their box; y and x [frame px]
     """
-    at = [
-        tuple(axis + o for axis, o in zip(np.indices(m.shape), origin, strict=True))
-        for origin, m in zip(origins, morphs, strict=True)
-    ]
-    beyond = np.zeros((len(morphs), 6)) if beyond is None else beyond
-    sums = light @ beyond
-    for (y, x), m, part in zip(at, morphs, light, strict=True):
-        sums = sums + part * np.array([(v * m).sum() for v in (1, y, x, y * y, y * x, x * x)])
+    # about the middle of the box, for images in float32
+    middle = (np.array(images.shape[1:]) - 1) / 2
+    y, x = np.indices(images.shape[1:]) - middle[:, None, None]
+    sums = sums_with(images, np.stack([np.ones(y.shape), y, x, y * y, y * x, x * x]))
+    (one, y, x, yy, yx, xx), (a, b) = sums.astype(np.float64), origin + middle
+    yy, yx, xx = yy + 2 * a * y + a * a * one, yx + a * x + b * y + a * b * one, xx + 2 * b * x
+    return np.array([one, y + a * one, x + b * one, yy, yx, xx + b * b * one])
+
+
+def moment_derivatives(sums):
+    """Derivatives (5, 6) of the moments (y, x, yy, yx, xx) of light by its sums (6,)."""
     total, (y, x, yy, yx, xx) = sums[0], sums[1:] / sums[0]
-    centre = np.array([yy - y * y, yx - y * x, xx - x * x])
-    slopes = []
-    for own_y, own_x in at:
-        dy, dx = own_y - y, own_x - x
-        second = np.array([dy * dy, dy * dx, dx * dx]) - centre[:, None, None]
-        slopes.append(np.concatenate([[dy, dx], second]) / total)
-    q = y * y - centre[0], y * x - centre[1], x * x - centre[2]
     by_sums = [
         [-y, 1, 0, 0, 0, 0],
         [-x, 0, 1, 0, 0, 0],
-        [q[0], -2 * y, 0, 1, 0, 0],
-        [q[1], -x, -y, 0, 1, 0],
-        [q[2], 0, -2 * x, 0, 0, 1],
+        [2 * y * y - yy, -2 * y, 0, 1, 0, 0],
+        [2 * y * x - yx, -x, -y, 0, 1, 0],
+        [2 * x * x - xx, 0, -2 * x, 0, 0, 1],
     ]
-    return slopes, np.array(by_sums) / total
+    return np.array(by_sums) / total

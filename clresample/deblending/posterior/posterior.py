@@ -16,13 +16,13 @@ from ..assessment.status import with_misfit_status
 from ..component_images import local_chi2
 from ..linear.aligned_observation import align_observations
 from ..linear.block_matrix import BlockCholesky
-from ..linear.mode_images import ModeImages, sums_with
+from ..linear.mode_images import ModeImages
 from ..linear.normal import UnknownLayout, normal_matrix
 from ..result import noted
 from .bound_bias import negative_chi2_gradient
 from .errors import Errors, MorphologyErrors, PosteriorSampler
 from .modes import FLOOR_EXPONENT, Solution, clipped_power
-from .moments import moment_derivatives
+from .moments import light_sums, moment_derivatives
 from .residuals import channel_residuals, misfit_error_scale
 from .shared_light import (
     doubted_shapes,
@@ -96,25 +96,28 @@ class Posterior:
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
         slopes, flux = self.flux_slopes, np.zeros((n_sources, self.layout.n_channels))
-        np.add.at(flux, owner, self.solution.spectra * self._totals[:, None])
+        totals = np.array([sums[0, 0] for sums in self._sums])
+        np.add.at(flux, owner, self.solution.spectra * totals[:, None])
         n_channels = len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
         colour = np.zeros((n_sources, n_channels, n_channels))
         for (i, j), block in self.covariance.items():
             if j == self.layout.common:
                 continue
-            found, s, t = slopes[i] @ block @ slopes[j].T, owner[i], owner[j]
-            between[:, s, t] += np.diag(found)
+            part, s, t = slopes[i] @ block, owner[i], owner[j]
+            by_channel = np.einsum("cu,cu->c", part, slopes[j])
+            between[:, s, t] += by_channel
             if i != j:
-                between[:, t, s] += np.diag(found)
+                between[:, t, s] += by_channel
             if s == t:
+                found = part @ slopes[j].T
                 colour[s] += found if i == j else found + found.T
         floor, far = np.zeros((2, *flux.shape))
         for i, (slope, beyond) in enumerate(zip(slopes, self.beyond, strict=True)):
             spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
             own = spectrum * slope[0, -self.layout.n_spectra]  # its flux
             floor[owner[i]] += flux_error_floor * clipped_power(unlike, FLOOR_EXPONENT) * own
-            far[owner[i]] += FAR_ERROR * spectrum * beyond.sums[0]
+            far[owner[i]] += FAR_ERROR * spectrum * beyond[0, 0]
         for common in (floor, far):  # to all channels of a source
             between[:, np.arange(n_sources), np.arange(n_sources)] += common.T**2
             colour += common[:, :, None] * common[:, None, :]
@@ -129,7 +132,7 @@ class Posterior:
             colour * scale[:, :, None] * scale[:, None],
             moments * wide[:, None, None] ** 2,
             MorphologyErrors(self.draws(owner, residuals, unit)),
-            np.array([far.sums for far in self.beyond]),
+            np.array([far[:, 0] for far in self.beyond]),
             released * unit,
             moved,
             residuals,
@@ -141,22 +144,23 @@ class Posterior:
         return PosteriorSampler(self.modes, self.factor, unit, wide, self.layout.ties)
 
     @cached_property
-    def _totals(self):
-        """Light (n,) of the components for spectra of 1."""
-        morphs = self.solution.morphs
-        return np.array([m.sum() + b.sums[0] for m, b in zip(morphs, self.beyond, strict=True)])
+    def _sums(self):
+        """`light_sums` (6, 1 + k) of each component's morphology and modes, beyond its box too."""
+        pairs = zip(self.solution.scene.origin, self.solution.morphs, self.modes, self.beyond)
+        return [
+            far + np.concatenate([light_sums(morph[None], at), light_sums(modes, at)], axis=1)
+            for at, morph, modes, far in pairs
+        ]
 
     @cached_property
     def flux_slopes(self):
         """Slopes (C, k + B) of each component's flux by its unknowns."""
-        s, slopes, ties = self.solution, [], self.layout.ties
+        ties = self.layout.ties
         of_channels = np.eye(self.layout.n_channels) if ties is None else ties.matrix
-        for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
-            far = self.beyond[i]
-            sums = sums_with(modes, np.ones((1, *morph.shape), modes.dtype))[0]
-            by_mode = np.outer(s.spectra[i], sums + far.slopes[0])
-            slopes.append(np.concatenate([by_mode, self._totals[i] * of_channels], axis=1))
-        return slopes
+        return [
+            np.concatenate([np.outer(spectrum, sums[0, 1:]), sums[0, 0] * of_channels], axis=1)
+            for spectrum, sums in zip(self.solution.spectra, self._sums, strict=True)
+        ]
 
     def _moments(self, owner, n_sources, error):
         """Covariances (S, 5, 5) of centroids and second moments, and their bound bias (S, 5).
@@ -172,17 +176,12 @@ class Posterior:
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
                 continue
-            far = np.array([self.beyond[i].sums for i in own])
-            slopes, by_far = moment_derivatives(
-                s.scene.origin[own], [s.morphs[i] for i in own], light, far
-            )
+            sums = [part * self._sums[i] for i, part in zip(own, light, strict=True)]
+            by_sums = moment_derivatives(sum(one[:, 0] for one in sums))
             rows = []
-            for i, slope, part in zip(own, slopes, light, strict=True):
-                flat = slope.reshape(5, -1)
-                by_mode = sums_with(self.modes[i], slope)
-                by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
-                by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
-                rows.append(np.concatenate([by_mode, by_light[:, None] * by_band], axis=1))
+            for one, part in zip(sums, light, strict=True):
+                slopes = by_sums @ one
+                rows.append(np.concatenate([slopes[:, 1:], slopes[:, :1] / part * by_band], axis=1))
             covariance = np.zeros((5, 5))
             for a, i in enumerate(own):
                 for b, j in enumerate(own):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ...sky.box import box_slices
 from ..profiles import SIZE_SCATTER, GalaxyProfile, StarProfile
+from .moments import light_sums
 
 # Scatter of galaxies in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, for errors. The prior
 # of fits is narrower, which gives better models of faint galaxies. With that prior the coverage
@@ -37,52 +36,10 @@ SHAPE_MODES = np.arange(-8, -4)
 FAR_PX, FAR_LIGHT, FAR_HALO = 24, 0.003, 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class OutsideBoxMoments:
-    """Flux and moments of a component's profile beyond its box.
-
-    sums (6,): of the profile times 1, y, x, y y, y x, x x [frame px], where its maximum is 1
-    slopes (6, k): of the sums by the coefficients of the modes
-    """
-
-    sums: np.ndarray
-    slopes: np.ndarray
-
-    @classmethod
-    def of(cls, images, low, box):
-        """Those of images (1 + k, ny, nx), the profile and its modes, about a box.
-
-        Images are set to 0 in the box (slices y, x); low (2,) [frame px]: their first pixel.
-        """
-        n_y, n_x = images.shape[1:]
-        images[:, *box] = 0
-        y, x = np.arange(n_y) + low[0], np.arange(n_x) + low[1]
-        rows = np.stack([np.ones(n_y), y, y * y]) @ images  # (1 + k, 3, nx)
-        found = rows @ np.stack([np.ones(n_x), x, x * x], axis=1)
-        sums = found[:, [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]].T
-        return cls(sums[:, 0], sums[:, 1:])
-
-    @classmethod
-    def none(cls, k):
-        """Zero, for a component with k modes."""
-        return cls(np.zeros(6), np.zeros((6, k)))
-
-    def scaled(self, scales):
-        """The moments for the profile and its modes times scales (1 + k,)."""
-        return OutsideBoxMoments(self.sums * scales[0], self.slopes * scales[1:])
-
-    def with_gauge(self, along):
-        """The moments of more modes, from which `along` (k,) times the profile was subtracted.
-
-        The new modes come before the present ones.
-        """
-        slopes = np.zeros((6, len(along)))
-        slopes[:, len(along) - self.slopes.shape[1] :] = self.slopes
-        return OutsideBoxMoments(self.sums, slopes - np.outer(self.sums, along))
-
-
 def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
-    """Slopes (k, ny, nx) of a profile in its box, prior scatter (k,), OutsideBoxMoments.
+    """Slopes (k, ny, nx) of a profile in its box, prior scatter (k,), and sums beyond the box.
+
+    These are the `light_sums` (6, 1 + k) of the profile and of its slopes.
 
     shape: ComponentProfile; theta (n,): its parameters; position (2,) [px]: in the frame
     profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
@@ -92,7 +49,7 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     if isinstance(shape, StarProfile):
         drawn = shape.draw_box(np.zeros(len(theta)), position, origin, profile.shape)
         drawn /= drawn[0].max()
-        return drawn[1:], shape.scatter, OutsideBoxMoments.none(len(theta))
+        return drawn[1:], shape.scatter, np.zeros((6, 1 + len(theta)))
     if isinstance(shape, GalaxyProfile):
         low, size = _surroundings(shape, theta, position, np.array(origin), profile.shape)
         box = box_slices(origin - low, profile.shape)
@@ -101,15 +58,13 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
         images = np.concatenate([drawn, _core_and_halo(drawn[0])])
         near = images[1:, *box].copy()
         scatter = np.concatenate([SCATTER, [POSITION_PX] * 2, core_and_halo])
-        far = OutsideBoxMoments.of(images, low, box)
-        return near, scatter, far.scaled(np.append(np.ones(len(drawn)), [FAR_HALO] * 2))
+        images[:, *box] = 0
+        far = light_sums(images, low) * np.append(np.ones(len(drawn)), [FAR_HALO] * 2)
+        return near, scatter, far
     slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])  # of a given image
     images = np.concatenate([slopes, _core_and_halo(profile)])
-    return (
-        images,
-        np.array([POSITION_PX, POSITION_PX, *core_and_halo]),
-        OutsideBoxMoments.none(len(images)),
-    )
+    scatter = np.array([POSITION_PX, POSITION_PX, *core_and_halo])
+    return images, scatter, np.zeros((6, 1 + len(images)))
 
 
 def _surroundings(galaxy, theta, position, origin, size):

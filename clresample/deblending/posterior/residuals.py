@@ -108,7 +108,9 @@ def max_filtered_residuals(result, i_observation):
 
 def _scatter(values):
     """Robust scatter, 1 or more, of values (n,) of the sky."""
-    return max(1.0, np.median(np.abs(values)) / HALF_WIDTH)
+    middle = (len(values) - 1) // 2, len(values) // 2
+    size = np.partition(np.abs(values), middle)  # half the time of np.median
+    return max(1.0, size[list(middle)].mean() / HALF_WIDTH)
 
 
 def fine_scatter(image, used):
@@ -172,12 +174,12 @@ def _filtered(residual, weights, kernels):
     for first in range(0, len(residual), step):
         c = slice(first, first + step)
         w, kernel = weights[c], kernels[c, ::-1, ::-1]
-        variance = convolved(w, kernel**2)
+        variance, sums = convolved(np.stack([w, w * residual[c]]), np.stack([kernel**2, kernel]))
         most = variance.max(axis=(1, 2), keepdims=True, initial=0)
         seen = (variance > MIN_WEIGHT * most) & (w > 0)
-        root = np.sqrt(variance[seen])
-        found[c][seen] = convolved(w * residual[c], kernel)[seen] / root
-        point[c][seen] = 1 / root
+        root = np.sqrt(variance, out=np.ones_like(variance), where=seen)
+        np.divide(1, root, out=point[c], where=seen)
+        np.multiply(sums, point[c], out=found[c], where=seen)
     return found, point
 
 
@@ -201,7 +203,8 @@ def _owners(result, i_observation, positions):
         light = _light(result, i_observation, s, window)
         best, first = most[:, *window], owner[:, *window]  # views
         brighter = inside & (light > best)
-        first[brighter], best[brighter] = s, light[brighter]
+        np.copyto(first, s, where=brighter)
+        np.copyto(best, light, where=brighter)
     return owner
 
 

@@ -144,34 +144,39 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
     components, n_sources = result.components, len(result.sources)
     scene, source = solution.scene, solution.source
     out = np.zeros((n_sources, n_sources, len(result.channels)))
-    rings = [(_Isophotes(p, np.inf), _Isophotes(p, RING_STEP)) for p in scene.profile]
-    structure = [
-        [] if fixed else [some.without(c.morphology) for some in its]
-        for c, fixed, its in zip(components, scene.fixed, rings, strict=True)
-    ]
     low, high = scene.origin, scene.origin + [p.shape for p in scene.profile]
-    for i, p in enumerate(scene.profile):
+    meet = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
+    meet &= (source[:, None] != source) & ~scene.fixed
+    rings = {j: _isophotes(scene.profile[j]) for j in np.flatnonzero(meet.any(axis=0))}
+    structure = {j: [r.without(components[j].morphology) for r in rings[j]] for j in rings}
+    for i in np.flatnonzero(meet.any(axis=1)):
+        p = scene.profile[i]
         if i in shapes:
             p = _larger_profile(solution, i, shapes[i].size_scatter)
-        meet = ((low < high[i]) & (high > low[i])).all(axis=1) & (source != source[i])
-        for j in np.flatnonzero(meet & ~scene.fixed):
+        power = np.square(p).sum()
+        for j in np.flatnonzero(meet[i]):
             here, there = intersect_boxes(low[i], p.shape, low[j], scene.profile[j].shape)
             most, found = components[j].morphology.sum(), []
             for some, rest in zip(rings[j], structure[j], strict=True):
-                off = np.square(p).sum() - some.power_within(p[here], there)
+                off = power - some.power_within(p[here], there)
                 found.append((p[here] * rest[there]).sum() / max(off, 1e-30))
             part = np.clip(p.sum() * max(found, key=abs), -most, most)
             out[components[i].source, components[j].source] += part * components[j].spectrum
     return out
 
 
-class _Isophotes:
-    """Rings of a width `step` in the logarithm of a profile (ny, nx), and projections P on it."""
+def _isophotes(profile):
+    """The _Isophotes of a profile (ny, nx) as one ring, and in rings of RING_STEP."""
+    depth = np.log(profile.max() / np.maximum(profile, MIN_LEVEL * profile.max()))
+    rings = np.zeros(depth.shape, int), (depth / RING_STEP).astype(int)
+    return [_Isophotes(profile, ring) for ring in rings]
 
-    def __init__(self, profile, step):
-        self.profile = profile
-        depth = np.log(profile.max() / np.maximum(profile, MIN_LEVEL * profile.max()))
-        self.ring = (depth / step).astype(int)
+
+class _Isophotes:
+    """Rings of a profile (ny, nx), by number, and projections P on it."""
+
+    def __init__(self, profile, ring):
+        self.profile, self.ring = profile, ring
         self.power = np.bincount(self.ring.ravel(), np.square(profile).ravel())
         self.power = np.maximum(self.power, 1e-30)
 

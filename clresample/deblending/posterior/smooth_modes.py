@@ -179,8 +179,8 @@ def _most(rows, columns, image):
 
     Rows (k, ny) and columns (l, nx), none of them negative.
     """
-    by_row = np.empty((len(rows), image.shape[1]))
-    for row, most in zip(rows, by_row, strict=True):
-        near = row > TINY
-        (row[near, None] * image[near]).max(0, out=most)
+    by_row, near = np.empty((len(rows), image.shape[1])), rows > TINY
+    ends = zip(near.argmax(1), rows.shape[1] - near[:, ::-1].argmax(1), strict=True)
+    for row, most, (low, high) in zip(rows[:, :, None], by_row, ends, strict=True):
+        (row[low:high] * image[low:high]).max(0, out=most)
     return (by_row[:, None] * columns).max(2)
