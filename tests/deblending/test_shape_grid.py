@@ -214,7 +214,7 @@ def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(g
     gain = np.full((len(SIZE_STEPS), len(LN_BETA)), -90.0)
     gain[6, 3] = 20
     found, fit = grid(gain, far=np.full(len(FAR_STEPS), 20.0))
-    found.gain[0] = 0
+    found.gain[0] = 1
     theta, (change, scatter, _) = found.posterior(fit)
     np.testing.assert_array_equal(theta, found.theta[0])
     far = found.flux[[7 * 4, *range(29, 33)]], [1, 8, 8, 8, 8]
@@ -229,12 +229,15 @@ def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(g
      (0, 24, 1, False), (0, 26, 1, True)],
 )  # fmt: skip
 def test_fits_again_are_from_significant_profiles(grid, present, gain, contamination, found):
-    """Better by 1 with the prior, 1.8 contamination here, and by 25 contamination than no light."""
+    """Better by 1 with the prior, 1.8 contamination here, and by 25 contamination than no light.
+    The flux stays where such a profile is left, or the present one has no light."""
     gains = np.zeros((len(SIZE_STEPS), len(LN_BETA)))
     gains[4, 0] = gain
     alternatives, fit = grid(gains, contamination)
     alternatives.gain[0] = present
     assert alternatives.best(fit) == (1 + 4 * len(LN_BETA)) * found
+    _, (change, scatter, _) = alternatives.posterior(fit)
+    assert (change[0] == 0) == (found or not present) and scatter[0] > 0
 
 
 @pytest.mark.parametrize("snr, n_far", [(14, 0), (6, 4), (0, 4)])

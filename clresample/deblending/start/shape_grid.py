@@ -23,7 +23,9 @@ weights w_k of more unusual galaxies, UNUSUAL_IN_FLUXES, catalogues have the mea
 
 for the flux f_0 and the noise n_0 of the fitted profile, and errors have both parts of the
 variance, the second one for each channel alone (posterior.py). In the light of neighbours the
-weights are the prior's alone, and the flux stays.
+weights are the prior's alone, and the flux stays. It also stays where the grid has a better profile
+that the fit of all galaxies refused, since that profile holds a neighbour's light, and where the
+fitted profile has no light, since its contamination is not known then.
 """
 
 from __future__ import annotations
@@ -122,7 +124,8 @@ class ShapeGrid:
         likelihood = np.exp((gain - gain.max()) / (2 * contamination))
         likelihood[n_near:] *= FAR_WEIGHT
         weight, _ = _weights(likelihood, usual, UNUSUAL_IN_FLUXES)
-        change = (weight @ flux - about) / contamination
+        stays = self.best(fit) > 0 or self.gain[0] <= 0
+        change = (weight @ flux - about) / (np.inf if stays else contamination)
         scatter = np.sqrt(weight @ np.square(flux - about - change))
         noise = np.sqrt(np.maximum(weight @ self.variance[1:] - self.variance[0], 0))
         return found, np.stack([change, scatter, noise])
