@@ -236,7 +236,7 @@ class Result(ResultDisplay):
         set to 0, so that faint sources are brighter in the mean; pixels at that bound stay at 0.
         Morphologies keep their scale, so that their maximum is no longer 1. Misfitted sources have
         a larger scatter, as in Errors. Fluxes scatter about those of the components, not about
-        those of `fluxes` and the catalogue, which include Errors.flux_bound_bias.
+        those of `fluxes` and the catalogue, which include Errors.flux_correction.
         Settings.flux_error_floor and light beyond the boxes are not included, so that fluxes of
         faint sources scatter by up to a tenth less than in `errors`. For misfitted sources at
         positions where light was missed the bound at 0 reduces the scatter by up to 0.4, because

@@ -42,7 +42,7 @@ ERRORS = {
     "OUTSIDEBOX": "outside_box_moments",
 }
 ERRORS |= {
-    "FLUXBIAS": "flux_bound_bias",
+    "FLUXBIAS": "flux_correction",
     "MOMENTBIAS": "moment_bound_bias",
     "RESIDUALMAX": "residuals",
     "OUTER": "outside",

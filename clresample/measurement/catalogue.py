@@ -139,7 +139,7 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
     positions = result.frame.positions_of(result.sources)
     add_positions(table, result.frame.grid, positions, "")
-    bounded = flux if result.errors is None else flux - result.errors.flux_bound_bias
+    bounded = flux if result.errors is None else flux - result.errors.flux_correction
     table.put("flags", _flags(result, bounded, error, positions, result.footprints))
     fitted = fitted_sources(result)
     with np.errstate(divide="ignore", invalid="ignore"):

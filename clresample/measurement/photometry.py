@@ -17,8 +17,9 @@ def fluxes(result):
     over the components i of s and j of t: with morphologies fixed. If the result has Errors, the
     covariances are theirs, marginalised over morphologies. |S| then includes the light of the
     smooth profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The
-    bias of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
-    `Errors.flux_bound_bias`; so F can be negative.
+    bias of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, so
+    that F can be negative; F of a faint galaxy is its mean over sizes and wings that fit the data.
+    Both are `Errors.flux_correction`.
 
     result: a fitted blend
     returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
@@ -32,7 +33,7 @@ def fluxes(result):
             sums[component.source, i] += result.errors.outside_box_moments[i, 0]
     flux = sums @ spectra_of(result)
     if result.errors is not None:
-        flux = flux + result.errors.flux_bound_bias
+        flux = flux + result.errors.flux_correction
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
     if result.errors is None:

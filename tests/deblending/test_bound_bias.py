@@ -86,7 +86,7 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     results = deblend_many(blends, device=device)
     found = np.array([fluxes(r)[0][0] for r in results])
     error = np.sqrt(np.mean([np.einsum("css->sc", fluxes(r)[1])[0] for r in results], axis=0))
-    released = np.array([r.errors.flux_bound_bias[0] for r in results])
+    released = np.array([r.errors.flux_correction[0] for r in results])
     assert (released < 0).mean() > 0.9
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
     # each is known to 1 / sqrt(32 noises of 3 bands) = 0.1, their difference better

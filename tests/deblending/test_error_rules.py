@@ -268,7 +268,7 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
     released = np.concatenate(made.released[:3])
     np.testing.assert_allclose(
-        errors.flux_bound_bias, (by @ released).reshape(2, 2) * unit, rtol=1e-6
+        errors.flux_correction, (by @ released).reshape(2, 2) * unit, rtol=1e-6
     )
     own, beyond = np.zeros((2, 2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):

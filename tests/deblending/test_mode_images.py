@@ -83,7 +83,7 @@ def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
         a, b = (np.sqrt(np.diagonal(c, axis1=1, axis2=2)) for c in (a, b))
         np.testing.assert_allclose(a, b, rtol=0.02)
     error = np.sqrt(np.diagonal(fine.colour, axis1=1, axis2=2))
-    np.testing.assert_allclose((wide.flux_bound_bias - fine.flux_bound_bias) / error, 0, atol=0.02)
+    np.testing.assert_allclose((wide.flux_correction - fine.flux_correction) / error, 0, atol=0.02)
     np.testing.assert_allclose(wide.flux[:, 0, 1], fine.flux[:, 0, 1], rtol=0.05)
     assert np.abs(draws[0] - draws[1]).max() < 0.2 * draws[1].max()
 

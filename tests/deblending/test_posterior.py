@@ -87,7 +87,7 @@ def test_the_normal_matrix_is_that_of_the_rendered_frame(device, monkeypatch, ob
 
 
 def test_fluxes_count_what_lies_beyond_boxes(fitted):
-    total = fluxes(fitted)[0] - fitted.errors.flux_bound_bias
+    total = fluxes(fitted)[0] - fitted.errors.flux_correction
     for i, c in enumerate(fitted.components):
         more = 1 + fitted.errors.outside_box_moments[i, 0] / c.morphology.sum()
         assert 1 < more < 1.2
@@ -198,7 +198,7 @@ def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted, mon
     """Times the cube of how unlike smooth profiles the sources are, found to be near 1."""
     kept = capture(monkeypatch)
     floored = scenes.fit(blend(BRIGHT), device, settings=Settings(flux_error_floor=0.01))
-    flux = fluxes(fitted)[0] - fitted.errors.flux_bound_bias
+    flux = fluxes(fitted)[0] - fitted.errors.flux_correction
     unlike = np.array([kept[0].posterior.solution.structure_excess(i) for i in (0, 1)])
     assert ((unlike > 0.5) & (unlike < 1.5)).all()
     floor = 0.01 * unlike[:, None] ** 3 * flux
@@ -259,7 +259,7 @@ def test_drawn_fluxes_scatter_about_the_catalogues(fitted):
             c.morphology.sum() + fitted.errors.outside_box_moments[i, 0]
         )
     by_hand += fitted.draws.flux_changes.draw(len(flux), rng)
-    np.testing.assert_allclose(drawn[0], by_hand + fitted.errors.flux_bound_bias)
+    np.testing.assert_allclose(drawn[0], by_hand + fitted.errors.flux_correction)
 
 
 def test_stored_and_read_back(fitted, tmp_path):
@@ -270,7 +270,7 @@ def test_stored_and_read_back(fitted, tmp_path):
         "colour",
         "moments",
         "outside_box_moments",
-        "flux_bound_bias",
+        "flux_correction",
         "moment_bound_bias",
         "residuals",
     ):

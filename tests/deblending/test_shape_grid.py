@@ -14,9 +14,10 @@ from clresample.deblending.start.shape_grid import (
     FAR_STEPS,
     LN_BETA,
     SIZE_STEPS,
-    UNUSUAL_IN_ERRORS,
+    UNUSUAL_IN_FLUXES,
     ShapeGrid,
 )
+from clresample.measurement.photometry import fluxes
 
 SHAPE, SIDE_PX = (64, 64), 160
 PLACES = (31.3, 32.1), (14.0, 40.0)
@@ -113,24 +114,26 @@ def test_a_large_galaxy_without_light_in_a_small_profile_is_found(fitted):
     assert abs(flux - image.sum()) < 2 * error < image.sum()
 
 
-def test_errors_hold_the_scatter_beside_the_curvature(fitted):
+def test_fluxes_and_errors_hold_the_estimate_beside_the_curvature(fitted):
     """In fluxes, colours and draws."""
     image = galaxy(2.5, 0.8, 12)
     (fit,), result = fitted(image)
 
     def unscattered(fit, scenes):
         shape_grid.fit_faint_shapes(fit, scenes)
-        fit.flux_scatter[:] = 0
+        fit.flux_estimate[:] = 0
 
     _, without = fitted(image, looked=unscattered)
-    scatter = fit.flux_scatter[0, 0]
-    assert scatter > 0.15 * result.components[0].flux[0]
+    change, scatter, noise = fit.flux_estimate[0, :, 0]
+    assert scatter > 0.15 * result.components[0].flux[0] and noise > 0
     variance, curvature = result.errors.flux[0, 0, 0], without.errors.flux[0, 0, 0]
-    assert variance == pytest.approx(scatter**2 + curvature, rel=1e-3)
+    assert variance == pytest.approx(scatter**2 + noise**2 + curvature, rel=1e-3)
     assert result.errors.colour[0, 0, 0] == pytest.approx(variance)
     changes = result.draws.flux_changes
-    assert changes.source.tolist() == [0] and changes.change.tolist() == [0]
-    assert changes.by[0, 0] == pytest.approx(scatter, rel=1e-3)
+    assert changes.source.tolist() == [0, 0] and changes.change.tolist() == [0, 1]
+    np.testing.assert_allclose(changes.by[:, 0], [scatter, noise], rtol=1e-3)
+    moved = fluxes(result)[0] - fluxes(without)[0]
+    assert moved[0, 0] == pytest.approx(change, rel=1e-3) and change > 0.03 * scatter
 
 
 def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatter(fitted):
@@ -143,16 +146,22 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
 
     (fit,), _ = fitted(galaxy(2.5, 6.5, 3), looked=looked)
     np.testing.assert_array_equal(fit.theta, before[0])
-    assert fit.flux_scatter[0, 0] > 1
+    assert fit.flux_estimate[0, 1, 0] > 1
 
 
-def test_errors_hold_larger_profiles_of_a_galaxy_without_significant_light(fitted):
+def test_fluxes_and_errors_hold_larger_profiles_of_a_galaxy_without_significant_light(fitted):
     """Ten times the expected size, at signal to noise 4.5: none is significant."""
     middle = (SIDE_PX / 2, SIDE_PX / 2)
     image = galaxy(25.0, 6.0, 4.5, middle, (SIDE_PX, SIDE_PX))
-    (fit,), _ = fitted(image, [middle], fit_shifts=False)
+    (fit,), result = fitted(image, [middle], fit_shifts=False)
     assert np.exp(fit.theta[0, 0, 0]) < 5
-    assert fit.flux_scatter[0, 0] > 0.3 * image.sum()
+    flux, variance = (float(found.squeeze()) for found in fluxes(result))
+    assert fit.flux_estimate[0, 1, 0] > 0.2 * image.sum()
+    assert fit.flux_estimate[0, 2, 0] > 0.2 * image.sum()
+    assert (
+        abs(flux - image.sum()) < np.sqrt(variance)
+        and fit.flux_estimate[0, 0, 0] > 0.4 * image.sum()
+    )
 
 
 @pytest.fixture
@@ -167,23 +176,25 @@ def grid():
         flux = np.exp(theta[:, :1] - theta[:, 3:])
         near = np.broadcast_to(gain, (len(SIZE_STEPS), len(LN_BETA))).ravel()
         gains = np.concatenate([[50.0], near, far])
-        return ShapeGrid(0, 0, theta, gains, flux), SimpleNamespace(population=prior)
+        return ShapeGrid(0, 0, theta, gains, flux, flux**2 + 3), SimpleNamespace(population=prior)
 
     return made
 
 
 def test_a_usual_galaxy_stays_and_its_error_holds_the_distance(grid):
-    """The scatter is about the present flux; weights are prior and gain over contamination."""
+    """Weights are prior and gain over contamination; only so far does the mean count."""
     gain = 50 - np.abs(np.arange(len(SIZE_STEPS)) - 2)[:, None] * np.array([1, 1, 9, 9])
     found, fit = grid(gain, 2.0)
-    theta, scatter = found.posterior(fit)
+    theta, (change, scatter, noise) = found.posterior(fit)
     np.testing.assert_array_equal(theta, found.theta[0])
     away = (found.theta[1:][:, LEARNED] - [0, 1.9]) / [0.4, 0.7]
     prior = np.exp(-(away**2).sum(1) / 2) / (2 * np.pi * 0.28)
-    fraction = UNUSUAL_IN_ERRORS
+    fraction = UNUSUAL_IN_FLUXES
     weight = np.exp(gain.ravel() / 4) * ((1 - fraction) * prior + fraction / 12)
-    expected = np.average((found.flux[1:] - found.flux[0]) ** 2, axis=0, weights=weight)
-    np.testing.assert_allclose(scatter, np.sqrt(expected))
+    mean, square = (np.average(found.flux[1:] ** k, axis=0, weights=weight) for k in (1, 2))
+    np.testing.assert_allclose(change, (mean - found.flux[0]) / 2)
+    np.testing.assert_allclose(scatter**2, square - mean**2 + change**2)
+    np.testing.assert_allclose(noise**2, square - found.flux[0] ** 2)
 
 
 def test_an_unusual_galaxy_gets_the_mean(grid):
@@ -191,9 +202,10 @@ def test_an_unusual_galaxy_gets_the_mean(grid):
     gain = np.full((len(SIZE_STEPS), len(LN_BETA)), 10.0)
     gain[4, 3] = gain[6, 3] = 60
     found, fit = grid(gain)
-    theta, scatter = found.posterior(fit)
+    theta, (change, scatter, noise) = found.posterior(fit)
     np.testing.assert_allclose(theta, [0.9, 0.1, -0.2, LN_BETA[3]], atol=1e-3)
     one, other = found.flux[[1 + 4 * 4 + 3, 1 + 6 * 4 + 3]]
+    assert abs(change[0]) < 1e-3 * one[0]
     np.testing.assert_allclose(scatter, (other - one) / 2, rtol=1e-3)
 
 
@@ -202,12 +214,13 @@ def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(g
     gain = np.full((len(SIZE_STEPS), len(LN_BETA)), -90.0)
     gain[6, 3] = 20
     found, fit = grid(gain, far=np.full(len(FAR_STEPS), 20.0))
-    found.gain[0] = 0
-    theta, scatter = found.posterior(fit)
+    found.gain[0] = 1
+    theta, (change, scatter, _) = found.posterior(fit)
     np.testing.assert_array_equal(theta, found.theta[0])
-    at = [7 * 4, *range(29, 33)]
-    expected = np.average((found.flux[at] - found.flux[0]) ** 2, axis=0, weights=[1, 8, 8, 8, 8])
-    np.testing.assert_allclose(scatter, np.sqrt(expected), rtol=1e-3)
+    far = found.flux[[7 * 4, *range(29, 33)]], [1, 8, 8, 8, 8]
+    mean, square = (np.average(far[0] ** k, axis=0, weights=far[1]) for k in (1, 2))
+    np.testing.assert_allclose(found.flux[0] + change, mean, rtol=1e-3)
+    np.testing.assert_allclose(scatter, np.sqrt(square - mean**2), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -216,16 +229,19 @@ def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(g
      (0, 24, 1, False), (0, 26, 1, True)],
 )  # fmt: skip
 def test_fits_again_are_from_significant_profiles(grid, present, gain, contamination, found):
-    """Better by 1 with the prior, 1.8 contamination here, and by 25 contamination than no light."""
+    """Better by 1 with the prior, 1.8 contamination here, and by 25 contamination than no light.
+    The flux stays where such a profile is left, or the present one has no light."""
     gains = np.zeros((len(SIZE_STEPS), len(LN_BETA)))
     gains[4, 0] = gain
     alternatives, fit = grid(gains, contamination)
     alternatives.gain[0] = present
     assert alternatives.best(fit) == (1 + 4 * len(LN_BETA)) * found
+    _, (change, scatter, _) = alternatives.posterior(fit)
+    assert (change[0] == 0) == (found or not present) and scatter[0] > 0
 
 
-@pytest.mark.parametrize("snr, n_far", [(14, 0), (0, 4)])
-def test_larger_sizes_are_compared_without_significant_light(fitted, snr, n_far):
+@pytest.mark.parametrize("snr, n_far", [(14, 0), (6, 4), (0, 4)])
+def test_larger_sizes_are_compared_with_little_light(fitted, snr, n_far):
     """Up to 37 times the present size, beside the 28 profiles near it and the present one."""
     kept = []
 

@@ -49,6 +49,29 @@ def test_a_scene_with_clear_structure_learns_again(clear):
     assert not one.progress.significance_due(np.ones(2, bool))[0]  # it has looked, or learns
 
 
+def test_settled_scenes_of_one_source_count_their_parameters():
+    """Those of several sources, or with a sky level, may exchange light, and count none."""
+    one, asked, nothing = object.__new__(MultiscaleEngine), [], lambda *_: None
+    one.progress = begun(100, 100, 100, 100)
+    one.scenes = [SimpleNamespace(profile=[0] * n, fit_sky=False) for n in (1, 1, 2, 1)]
+    one.scenes[3].fit_sky = True
+    one._energies, one._rest_others = (lambda _: (0, 0)), nothing
+    found = SimpleNamespace(n_effective=np.array([[3.0, 20.0, 7.0]]))
+    one.strengths = SimpleNamespace(
+        learn=lambda *_: (np.array([0.05, 0.2, 0.05, 0.05]), None, np.zeros(4)),
+        request_blocks=nothing,
+        findings=lambda which, *_: (
+            asked.append(which.tolist()) or [found if on else None for on in which]
+        ),
+    )
+    one.vectors = SimpleNamespace(x_new=None)
+    one.steps = SimpleNamespace(reweigh=nothing, change=lambda: (None,))
+    one.strengths.light = None
+    one._learn(np.ones(4, bool))
+    assert asked == [[True, False, False, False]]
+    assert one.progress.n_determined.tolist() == [30, 0, 0, 0]
+
+
 def test_scenes_look_when_they_are_calm_and_settled():
     progress = begun(100, 100, 100, 100, 3 * N_PIXELS)
     progress.settled[[0, 1, 2, 4]] = True

@@ -58,13 +58,13 @@ def test_a_starting_point_is_of_profiles_with_maximum_1():
         scene=scene, components=components, normal=normal, spectra=rng.random((n, 3)),
         sky=rng.random((2, 3)),
     )  # fmt: skip
-    own = {"flux_scatter": rng.random((n, 3)), "flux_doubt": rng.random((n, 3, 2))}
+    own = {"flux_estimate": rng.random((n, 3, 3)), "flux_doubt": rng.random((n, 3, 2))}
     fit = SimpleNamespace(looking=looking, **own)
     for b, places in ((0, PLACES), (1, FAR)):
         dark = np.zeros(len(places), bool)
         found = room._point(given[b], fit, thetas, sources, b, dark)
         own = np.flatnonzero(scene == b)
-        for name in ("flux_scatter", "flux_doubt"):
+        for name in ("flux_estimate", "flux_doubt"):
             parts = [getattr(fit, name)[own[sources[own] == i]] for i in range(len(places))]
             np.testing.assert_allclose(getattr(found, name), [part.sum(0) for part in parts])
         drawn = [components[i].shape.draw(thetas[i], components[i].position)[0] for i in own]

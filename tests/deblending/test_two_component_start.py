@@ -268,7 +268,7 @@ def test_what_was_taken_over_has_its_first_shape_again():
             for name in ("drawn_positions", "peaks", "spectra", "spectrum_curvature")
         }
         rest = {"source": np.arange(n), "positions": 0, "undetected": 0, "sky": 0}
-        rest["flux_scatter"] = rest["flux_doubt"] = np.full((4, 1), first + 1.0)
+        rest["flux_estimate"] = rest["flux_doubt"] = np.full((4, 1), first + 1.0)
         thetas = [first + i for i in range(n)]
         return StartingPoint(shapes=shapes, thetas=thetas, **numbers, **rest)
 
@@ -280,5 +280,5 @@ def test_what_was_taken_over_has_its_first_shape_again():
     assert found.drawn_positions.tolist() == found.peaks.tolist() == [0, 11, 12, 13, 3]
     assert found.spectra.tolist() == found.spectrum_curvature.tolist() == [10, 11, 12, 13, 14]
     assert whole.shapes[0] is held and whole.peaks[0] == 10
-    assert found.flux_scatter.ravel().tolist() == [1, 1, 0, 1]
+    assert found.flux_estimate.ravel().tolist() == [1, 1, 0, 1]
     assert found.flux_doubt is begin.flux_doubt

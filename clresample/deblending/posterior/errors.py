@@ -37,9 +37,10 @@ class Errors:
     outside_box_moments (n, 6) [1, px, px^2]: a contribution to fluxes and moments, not an error:
         the sums of each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of
         the frame, if the morphology has its maximum 1
-    flux_bound_bias (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: corrections, not errors:
+    flux_correction (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: corrections, not errors:
         the changes of fluxes, and of centroids and second moments, without the bound of
-        morphologies at 0, see bound_bias.py; 0 for second moments of stars
+        morphologies at 0, see bound_bias.py; 0 for second moments of stars. Fluxes of faint
+        galaxies also have the change to their mean over sizes and wings, see start/shape_grid.py
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     outside (S, C) [counts]: flux of the models outside the observed area, see `light_outside`; its
         square is included in `flux` and `colour`. 0 by default
@@ -50,14 +51,14 @@ class Errors:
     moments: np.ndarray
     morphology: Sequence[np.ndarray]
     outside_box_moments: np.ndarray
-    flux_bound_bias: np.ndarray
+    flux_correction: np.ndarray
     moment_bound_bias: np.ndarray
     residuals: np.ndarray
     outside: np.ndarray | None = None
 
     def __post_init__(self):
         if self.outside is None:
-            object.__setattr__(self, "outside", np.zeros(np.shape(self.flux_bound_bias)))
+            object.__setattr__(self, "outside", np.zeros(np.shape(self.flux_correction)))
 
 
 @dataclass(frozen=True, eq=False)

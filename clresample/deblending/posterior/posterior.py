@@ -215,13 +215,16 @@ def with_errors(fit, result, peaks, seen):
         result, start.shapes, start.thetas, start.positions[start.source], peaks
     )
     fit.note_seconds("errors", time.perf_counter() - began)
-    widths = width_errors(result)
-    by_psf = np.hypot(core_errors(result), widths)
+    change, scatter, noise = np.zeros((3, len(result.sources), len(fit.unit)))
+    estimate = np.moveaxis(start.flux_estimate * fit.unit, 1, 0)
+    change[fit.fitted], scatter[fit.fitted], noise[fit.fitted] = estimate
+    errors = replace(errors, flux_correction=errors.flux_correction + change)
+    apart = np.hypot(width_errors(result), noise)
     # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
     # within their errors, by both together 70 % (bench.ladder, single).
-    shapes = missed_light(result)
-    shapes[fit.fitted] = np.hypot(shapes[fit.fitted], start.flux_scatter * fit.unit)
-    errors = with_core_errors(widened(with_common_error(errors, shapes), outside), by_psf)
+    shapes = np.hypot(missed_light(result), scatter)
+    errors = widened(with_common_error(errors, shapes), outside)
+    errors = with_core_errors(errors, np.hypot(core_errors(result), apart))
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
     division = np.zeros((*shapes.shape, start.flux_doubt.shape[2]))
@@ -231,7 +234,7 @@ def with_errors(fit, result, peaks, seen):
     errors = with_shared_light(errors, doubts, exchanged)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
-    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, widths)
+    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, apart)
     draws = replace(draws, flux_changes=changes)
     return noted(result, errors=errors, draws=draws)
 

@@ -35,7 +35,7 @@ def drawn_fluxes(result, n, rng):
     shape = n, len(result.sources), len(result.channels)
     found, beyond = np.zeros(shape), np.zeros(len(result.components))
     if result.errors is not None:
-        found += result.errors.flux_bound_bias
+        found += result.errors.flux_correction
         beyond = result.errors.outside_box_moments[:, 0]
     for one in found:
         for c, far in zip(drawn_components(result, rng), beyond, strict=True):

@@ -103,8 +103,8 @@ def _as_before(point, begin, chosen):
     held = np.flatnonzero(~new & drawn)
     shapes, thetas = list(point.shapes), list(point.thetas)
     places, peaks = point.drawn_positions.copy(), point.peaks.copy()
-    scatter = begin.flux_scatter.copy()
-    scatter[begin.source[list(chosen)]] = 0
+    estimate = begin.flux_estimate.copy()
+    estimate[begin.source[list(chosen)]] = 0
     for k in held:
         i = before[k]
         shapes[k], thetas[k] = begin.shapes[i], begin.thetas[i]
@@ -115,7 +115,7 @@ def _as_before(point, begin, chosen):
         thetas=thetas,
         drawn_positions=places,
         peaks=peaks,
-        flux_scatter=scatter,
+        flux_estimate=estimate,
         flux_doubt=begin.flux_doubt,
     )
 

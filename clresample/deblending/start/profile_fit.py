@@ -48,7 +48,8 @@ class ProfileFit:
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
-    flux_scatter (N, C): of the spectra of faint galaxies, see shape_grid.py; 0 for others
+    flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
+        is common to all channels, and that of each, see shape_grid.py; 0 for others
     flux_doubt (N, C, k): changes of fluxes, each of close pairs, see close_pairs.py
     """
 
@@ -64,7 +65,7 @@ class ProfileFit:
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness = np.zeros(len(shapes))
-        self.flux_scatter = np.zeros_like(looking.spectra)
+        self.flux_estimate = np.repeat(np.zeros_like(looking.spectra)[:, None], 3, axis=1)
         self.flux_doubt = np.zeros((*looking.spectra.shape, 0))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]

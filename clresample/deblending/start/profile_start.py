@@ -73,7 +73,7 @@ class StartingPoint:
     peaks (n,): by which profiles of unit integral are divided, so that max = 1
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
-    flux_scatter (S, C), flux_doubt (S, C, k): of the sources' fluxes, by size and wings of each
+    flux_estimate (S, 3, C), flux_doubt (S, C, k): of the sources' fluxes, by size and wings of each
         alone, and k changes of all of them by the division of light in pairs; see ProfileFit
     """
 
@@ -87,7 +87,7 @@ class StartingPoint:
     spectra: np.ndarray
     sky: np.ndarray
     spectrum_curvature: np.ndarray
-    flux_scatter: np.ndarray | float = 0.0
+    flux_estimate: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 1)))
     flux_doubt: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 0)))
 
     def __len__(self):
@@ -173,10 +173,10 @@ def _point(patch, fit, thetas, sources, b, dark):
         peaks[k] = profile_peak(c.shape, thetas[i], c.position, center, c.frame)
     power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
     n_sources = len(patch.sources)
-    scatter, doubt = (
-        np.zeros((n_sources, *values.shape[1:])) for values in (fit.flux_scatter, fit.flux_doubt)
+    estimate, doubt = (
+        np.zeros((n_sources, *values.shape[1:])) for values in (fit.flux_estimate, fit.flux_doubt)
     )
-    np.add.at(scatter, sources[at], fit.flux_scatter[at])
+    np.add.at(estimate, sources[at], fit.flux_estimate[at])
     np.add.at(doubt, sources[at], fit.flux_doubt[at])
     return StartingPoint(
         source=sources[at],
@@ -189,7 +189,7 @@ def _point(patch, fit, thetas, sources, b, dark):
         spectra=looking.spectra[at] * peaks[:, None],
         sky=looking.sky[b].copy(),
         spectrum_curvature=power / peaks[:, None] ** 2,
-        flux_scatter=scatter,
+        flux_estimate=estimate,
         flux_doubt=doubt[..., doubt.any(axis=(0, 1))],
     )
 

@@ -13,11 +13,19 @@ If a profile is better than the fitted one, the scene is fitted again from it. T
 
 are the posterior of size and wings. The prior and the contamination are the population's
 (population.py); unusual galaxies have any size and wings, and get the mean of both if most of the
-weight is theirs. Others, and those without significant light, stay as they are. Errors of fluxes
-include the flux's scatter about the value of these parameters (posterior.py), with more unusual
-galaxies, UNUSUAL_IN_ERRORS, and with the larger profiles of galaxies without significant light.
-Without that scatter 11 % of fluxes at signal to noise 5 are over 5 errors off, by up to 16, and
-6 % with it, by up to 8 (30 single galaxies of bench.ladder, seed 7777).
+weight is theirs. Others, and those without significant light, stay as they are.
+
+Fluxes f_k are skewed about that of one profile, and larger profiles have more noise n_k^2. With
+weights w_k of more unusual galaxies, UNUSUAL_IN_FLUXES, catalogues have the mean of all profiles,
+
+    f = f_0 + (sum w_k f_k - f_0) / contamination
+    var = sum w_k (f_k - f)^2 + sum w_k (n_k^2 - n_0^2)
+
+for the flux f_0 and the noise n_0 of the fitted profile, and errors have both parts of the
+variance, the second one for each channel alone (posterior.py). In the light of neighbours the
+weights are the prior's alone, and the flux stays. It also stays where the grid has a better profile
+that the fit of all galaxies refused, since that profile holds a neighbour's light, and where the
+fitted profile has no light, since its contamination is not known then.
 """
 
 from __future__ import annotations
@@ -39,21 +47,21 @@ MIN_SIZE_ERROR = 0.05
 # Fraction of galaxies of any size and wings, and the ranges of both. With 0.1, galaxies of n = 4
 # at signal to noise 10 to 20 are fainter by 0.15 of their errors (bench.ladder).
 UNUSUAL, SIZE_RANGE, WINGS_RANGE = 0.3, 4.0, 3.0
-# The same fraction for the scatter of fluxes, since models are better with a narrower prior than
-# errors. With 0.3 61 to 68 % of fluxes of galaxies of r_e 1.2 to 4 px at signal to noise 7 to 20
-# are within their errors, with 0.7 67 to 73 %, and of galaxies of 4 to 32 px 63 to 69 % with both
-# (bench.ladder, single).
-UNUSUAL_IN_ERRORS = 0.7
+# The same fraction for the mean and scatter of fluxes, since models are better with a narrower
+# prior than both. With 0.3 61 to 68 % of fluxes of galaxies of r_e 1.2 to 4 px at signal to noise 7
+# to 20 are within their errors, with 0.7 67 to 73 %, and of galaxies of 4 to 32 px 63 to 69 % with
+# both (bench.ladder, single).
+UNUSUAL_IN_FLUXES = 0.7
 # Posterior fraction of unusual galaxies from which an estimate moves. If all move, median SDRs of
 # simulated COSMOS galaxies are 0.3 dB lower in Euclid's images (32 scenes, seed 3000).
 MIN_UNUSUAL = 0.5
 # Steps from the fitted ln sigma, and the values of ln beta at each of them. With -2.1 as the least,
 # galaxies of n = 4 at signal to noise 10 to 20 are fainter by 0.2 of their errors (bench.ladder).
 SIZE_STEPS, LN_BETA = np.arange(-2, 5) * 0.3, np.array([1.9, 0.4, -1.1, -2.6])
-# Further steps for galaxies without significant light, and their ln beta: light of galaxies of r_e
-# over 25 px at signal to noise 10 to 15 is not significant in a small profile (bench.ladder). Each
-# of them stands for twice the step in size, and for all wings.
-FAR_STEPS, FAR_LN_BETA = np.array([1.8, 2.4, 3.0, 3.6]), 0.9
+# Further steps for galaxies whose light gains less than MAX_FAR_GAIN, and their ln beta: light of
+# galaxies of r_e over 25 px at signal to noise 10 to 15 is not significant in a small profile
+# (bench.ladder). Each of them stands for twice the step in size, and for all wings.
+MAX_FAR_GAIN, FAR_STEPS, FAR_LN_BETA = 2 * NEED, np.array([1.8, 2.4, 3.0, 3.6]), 0.9
 FAR_WEIGHT = 2.0 * len(LN_BETA)
 # Smallest decrease of chi2 for another fit.
 MIN_GAIN = 1.0
@@ -64,7 +72,7 @@ MAX_AT_ONCE, MAX_PIXELS = 8, 30_000_000
 def fit_faint_shapes(fit, scenes):
     """Sets size and wings of faint galaxies in some scenes (k,) of a ProfileFit from their grids.
 
-    Stores the scatter of their fluxes in its `flux_scatter`.
+    Stores the changes and errors of their fluxes in its `flux_estimate`.
     """
     grids = _grids(fit, _uncertain(fit, scenes))
     better = {i: grid.theta[k] for i, grid in grids.items() if (k := grid.best(fit))}
@@ -72,15 +80,15 @@ def fit_faint_shapes(fit, scenes):
         changed = _fitted_again(fit, better)
         grids |= _grids(fit, [i for i in grids if fit.looking.scene[i] in changed])
     for i, grid in grids.items():
-        fit.theta[grid.scene, grid.index], fit.flux_scatter[i] = grid.posterior(fit)
+        fit.theta[grid.scene, grid.index], fit.flux_estimate[i] = grid.posterior(fit)
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeGrid:
     """Alternative profiles of one component, the present one first; see the module's text.
 
-    scene, index: of the component; theta (K, 4); gain (K,); flux (K, C): in the frame, in the
-    views' units
+    scene, index: of the component; theta (K, 4); gain (K,); flux, variance (K, C): in the frame,
+        in the views' units, the latter by noise alone
     """
 
     scene: int
@@ -88,6 +96,7 @@ class ShapeGrid:
     theta: np.ndarray
     gain: np.ndarray
     flux: np.ndarray
+    variance: np.ndarray
 
     def contamination(self, fit):
         """Factor by which errors of its neighbours' models lower the data's precision."""
@@ -101,7 +110,7 @@ class ShapeGrid:
         return best if significant and loss[best] < loss[0] - MIN_GAIN else 0
 
     def posterior(self, fit):
-        """Parameters (4,) to be set, and the scatter (C,) of the flux about theirs."""
+        """Parameters (4,) to be set, and their row (3, C) of `ProfileFit.flux_estimate`."""
         theta, flux, gain = self.theta[1:], self.flux[1:], self.gain[1:]
         at = self.scene, self.index, LEARNED
         scatter, contamination = fit.population.scatter[at], self.contamination(fit)
@@ -114,8 +123,12 @@ class ShapeGrid:
             found, about = weight @ theta[:n_near], weight @ flux[:n_near]
         likelihood = np.exp((gain - gain.max()) / (2 * contamination))
         likelihood[n_near:] *= FAR_WEIGHT
-        weight, _ = _weights(likelihood, usual, UNUSUAL_IN_ERRORS)
-        return found, np.sqrt(weight @ np.square(flux - about))
+        weight, _ = _weights(likelihood, usual, UNUSUAL_IN_FLUXES)
+        stays = self.best(fit) > 0 or self.gain[0] <= 0
+        change = (weight @ flux - about) / (np.inf if stays else contamination)
+        scatter = np.sqrt(weight @ np.square(flux - about - change))
+        noise = np.sqrt(np.maximum(weight @ self.variance[1:] - self.variance[0], 0))
+        return found, np.stack([change, scatter, noise])
 
 
 def _weights(likelihood, usual, fraction):
@@ -161,11 +174,11 @@ def _computed(fit, components):
     looking.compute_residuals(MODEL_ERROR)
     row, present = looking.rows_of(looking.scene[components]), looking.spectra[components]
     power = looking.normal[row, :, looking.index[components], looking.index[components]]
-    significant = (np.square(present) * power).sum(axis=1) >= NEED
+    explained = (np.square(present) * power).sum(axis=1)
     thetas, (off, level) = fit.thetas(), (a[row] for a in looking.of_level())
     own = [
-        _alternatives(thetas[i], far=not light)
-        for i, light in zip(components, significant, strict=True)
+        _alternatives(thetas[i], far=light < MAX_FAR_GAIN)
+        for i, light in zip(components, explained, strict=True)
     ]
     owner, theta = np.repeat(np.arange(len(own)), [len(a) for a in own]), np.concatenate(own)
     first = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -183,7 +196,9 @@ def _computed(fit, components):
     right = np.maximum(right, 0)
     flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
     gain = right * flux if looking.ties is None else (right * flux)[:, looking.ties.first]
-    parts = gain.sum(axis=1), flux * part_inside(listed, theta)[:, None]
+    inside = part_inside(listed, theta)[:, None]
+    variance = np.divide(inside**2, alone, out=np.zeros_like(alone), where=alone > 0)
+    parts = gain.sum(axis=1), flux * inside, variance
     for q, i in enumerate(components):
         at = looking.scene[i], looking.index[i]
         yield i, ShapeGrid(*at, own[q], *(part[owner == q] for part in parts))

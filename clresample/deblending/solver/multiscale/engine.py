@@ -151,6 +151,10 @@ class MultiscaleEngine:
         self._rest_others(self.progress.live)
         self.steps.reweigh(self.strengths.light, weights)
         self.progress.record_strengths(due, moved, change)
+        settled = due & self.progress.settled & [_is_alone(s) for s in self.scenes]
+        for i, found in enumerate(self.strengths.findings(settled, energies, spectra)):
+            if found is not None:
+                self.progress.n_determined[i] = found.n_effective.sum()
         return self.steps.change()[0]  # its s and y go into spare slots
 
     def _rest_others(self, live):
@@ -206,6 +210,11 @@ class MultiscaleEngine:
         self.steps.follow(self.pairs, mode)
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
         self._rest_others(self.progress.live)
+
+
+def _is_alone(scene):
+    """Returns True if a scene has one source, and no sky level that takes its light."""
+    return len(scene.profile) == 1 and not scene.fit_sky
 
 
 def _begins(latents, states):
