@@ -14,7 +14,7 @@ from scipy.ndimage import (
 )
 from scipy.optimize import minimize
 
-from .psf_samples import inscribed_radius, psf_at
+from .psf_samples import inscribed_radius, ring_mean
 
 # [FWHM of the PSF] Smallest radius of the largest disc inside the masked pixels of a core: narrower
 # masks are bad columns and cosmic rays.
@@ -185,8 +185,9 @@ def _centred(light, ring, guess, fwhm):
 
     def scatter(place):
         away = np.hypot(y - place[0], x - place[1])
-        order = np.polynomial.polynomial.Polynomial.fit(away, value, 2)
-        return np.abs(value - order(away)).mean()
+        away = (away - away.mean()) / away.std()
+        powers = np.stack([np.ones_like(away), away, away**2])
+        return np.abs(value - np.linalg.solve(powers @ powers.T, powers @ value) @ powers).mean()
 
     found = minimize(
         scatter, guess, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 1e-4, "maxiter": 80}
@@ -209,11 +210,7 @@ def _falls_like(light, ring, place, psf, band, fwhm):
     falls, reach = bool(bright[1] < bright[0]), inscribed_radius(psf, band)
     is_large = reach >= MIN_WINGS_FWHM * fwhm
     inside = radii * min(1.0, reach / radii[1]) if is_large else radii
-    angles = np.arange(16) * np.pi / 8
-    own = [
-        np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
-        for r in inside
-    ]
+    own = [ring_mean(psf, band, r) for r in inside]
     if not min(own) > 0 or not (is_large or own[0] > own[1]):
         return falls
     return (is_large or falls) and bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])
