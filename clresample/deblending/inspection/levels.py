@@ -137,7 +137,7 @@ def _blocks(image):
 def _darker(image, centers, wings):
     """Rank (B,) of the blocks by the light of wings (C, B) in them, from 0, the darkest, to 1.
 
-    Infinite of those in a source, where this leaves enough others.
+    Infinite of those in a source.
     """
     light = (wings / image.sigma[:, None]).sum(axis=0) if len(wings) else np.zeros(len(centers))
     free = np.ones(len(centers), bool)
@@ -145,8 +145,6 @@ def _darker(image, centers, wings):
     if len(places):
         squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
         free = squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
-    if free.sum() < 2 * MIN_BLOCKS:
-        free[:] = True
     rank = np.full(len(centers), np.inf)
     order = np.argsort(light[free], kind="stable")
     rank[np.flatnonzero(free)[order]] = np.arange(len(order)) / max(len(order), 1)

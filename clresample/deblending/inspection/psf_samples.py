@@ -35,7 +35,9 @@ def psf_at(psf, band, y, x) -> np.ndarray:
 def ring_mean(psf, band, radius) -> float:
     """Mean value [1] of a band of a PSF on a circle of this radius [px] about its centre."""
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
-    return float(np.diag(psf_at(psf, band, radius * np.sin(angles), radius * np.cos(angles))).mean())
+    return float(
+        np.diag(psf_at(psf, band, radius * np.sin(angles), radius * np.cos(angles))).mean()
+    )
 
 
 def inscribed_radius(psf, band) -> float:

@@ -139,11 +139,7 @@ def _guesses(light, usable, masked):
 
 def _ring_about(light, usable, masked, guess, fwhm):
     """The place (2,) [px] of a core, its ring, inner radius and scatter; None without a ring."""
-    top = np.array(light.shape) - 1
     for _ in range(2):  # ring and position depend on each other
-        at = tuple(np.clip(np.rint(guess).astype(int), 0, top))
-        if not masked[at] and not binary_dilation(masked, np.ones((3, 3), bool))[at]:
-            return None
         ring, inner = _ring(usable, masked, guess, fwhm)
         if ring is None:
             return None
