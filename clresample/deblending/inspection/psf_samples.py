@@ -6,17 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
-
 # [px] Sub-pixel positions of a point at which the contrast of its image is evaluated: four more
 # change the sharpest contrast of a PSF of 1.5 px FWHM by less than a hundredth.
 PHASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
 # Contrast is that of a PSF narrower by this factor, so that no star's core is masked as a cosmic
 # ray: PSFs are measured to a few percent, and those of other exposures or filters differ by more.
 NARROWER = 1.25
-# Contrast of PSF images with more of their transform at their frequency limit
-# (psf_checks.LIMIT_TOLERANCE), in units of the computed one: their interpolation has such errors.
-COARSE_PART = 0.5
 N_ANGLES = 16  # of the circles over which a PSF is averaged
 
 
@@ -53,8 +48,7 @@ def pair_ratios(psf) -> np.ndarray:
         kappa_y = min_x [P(1 - x) + P(-1 - x)] / P(-x),    x: position of a point in its pixel
 
     Along y and along x, for the PSF made narrower by a quarter. Non-negative light convolved with
-    the PSF has at least this ratio everywhere: a pixel with less is not light from the sky. The
-    result is COARSE_PART of it for PSFs that are sampled too coarsely.
+    the PSF has at least this ratio everywhere: a pixel with less is not light from the sky.
     """
     places = NARROWER * (PHASES[:, None] + [-1.0, 0.0, 1.0]).ravel()
     n = len(PHASES)
@@ -65,5 +59,4 @@ def pair_ratios(psf) -> np.ndarray:
         along_y = (values[:, 0, :, 1] + values[:, 2, :, 1]) / middle
         along_x = (values[:, 1, :, 0] + values[:, 1, :, 2]) / middle
         ratios.append([along_y.min(), along_x.min()])
-    coarse = limit_power(psf.images) > LIMIT_TOLERANCE
-    return np.maximum(ratios, 0.0) * np.where(coarse, COARSE_PART, 1.0)[:, None]
+    return np.maximum(ratios, 0.0)

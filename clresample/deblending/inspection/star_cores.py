@@ -143,7 +143,7 @@ def _ring_about(light, usable, masked, guess, fwhm):
         ring, inner = _ring(usable, masked, guess, fwhm)
         if ring is None:
             return None
-        guess, scatter = _centred(light, ring, guess, fwhm)
+        guess, scatter = _centred(light, ring, guess)
     return guess, ring, inner, scatter
 
 
@@ -171,7 +171,7 @@ def _reach_of(masked, away):
     return float(away[~masked].min(initial=away.max()))
 
 
-def _centred(light, ring, guess, fwhm):
+def _centred(light, ring, guess):
     """Fits the centre (2,) [px] of a ring of light; also returns the scatter about it.
 
     The scatter is the mean deviation of the light's logarithm from a function of the radius.
@@ -181,15 +181,12 @@ def _centred(light, ring, guess, fwhm):
 
     def scatter(place):
         away = np.hypot(y - place[0], x - place[1])
-        away = (away - away.mean()) / away.std()
-        powers = np.stack([np.ones_like(away), away, away**2])
-        return np.abs(value - np.linalg.solve(powers @ powers.T, powers @ value) @ powers).mean()
+        powers = np.vander(away - away.mean(), 3)
+        return np.abs(value - powers @ np.linalg.lstsq(powers, value, rcond=None)[0]).mean()
 
     found = minimize(
         scatter, guess, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 1e-4, "maxiter": 80}
     )
-    if np.hypot(*(found.x - guess)) > 2 * fwhm:
-        return guess, scatter(guess)
     return found.x, float(found.fun)
 
 
