@@ -45,7 +45,7 @@ def core_errors(result) -> np.ndarray:
     return result.psf_error * found
 
 
-def star_variance(result, i) -> np.ndarray:
+def star_variance(result, i) -> np.ndarray | None:
     """Variance (Co, My, Mx) [counts^2] of an observation by the errors of its stars' PSFs, or None.
 
         psf_error^2 sum over stars of L^2 + (r . grad L)^2

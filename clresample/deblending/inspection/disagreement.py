@@ -90,9 +90,12 @@ def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, n
         for lit in (np.flatnonzero(about.any(axis=axis)) for axis in (1, 0))
     )
     near = near - [part.start for part in window]
-    splines = smear.of(one.data * (owner == np.arange(len(places))[:, None, None]), spline=True)
+    lights = (one.data * (owner == s) for s in range(len(places)))
     options = {"order": 3, "mode": "constant", "prefilter": False, "output": float}
-    images = [area * map_coordinates(image, at[:, *window], **options) for image in splines]
+    images = [
+        area * map_coordinates(smear.of(light, spline=True), at[:, *window], **options)
+        for light in lights
+    ]
     there = there.of(other.data)[window].astype(float)
     shifts, errors, brightness = _solved(images, there, good[window], np.sqrt(area))
     parts = np.array([_foreign(images, brightness, s, near[s], radius) for s in range(len(near))])
@@ -190,14 +193,14 @@ class Blur:
         if not plane.usable.all():
             self.hidden = self.of(~plane.usable) > HIDDEN
 
-    def of(self, images, spline=False):
-        """Images (..., My, Mx) convolved, without light from beyond their edges.
+    def of(self, image, spline=False):
+        """An image (My, Mx) convolved, without light from beyond its edges.
 
-        spline: coefficients of cubic B-splines instead, whose values at the pixels are the images
+        spline: coefficients of the cubic B-splines through its pixels instead
         """
-        transform = fft.rfft2(np.asarray(images, np.float32), self._size) * self._transfer
+        transform = fft.rfft2(np.asarray(image, np.float32), self._size) * self._transfer
         if spline:
             n_y, n_x = self._size
             at_pixels = (2 + np.cos(2 * np.pi * fft.fftfreq(n_y))[:, None]) / 3
             transform /= at_pixels * (2 + np.cos(2 * np.pi * fft.rfftfreq(n_x))) / 3
-        return fft.irfft2(transform, self._size)[..., *self._inside]
+        return fft.irfft2(transform, self._size)[self._inside]

@@ -98,16 +98,16 @@ def sharper_than_psf(image) -> np.ndarray:
     with np.errstate(divide="ignore"):
         least = (noise / kappa).min(axis=1)  # beside pixels without light
     c, y, x = np.nonzero(z[:, 1:-1, 1:-1] > least[:, None, None].astype(np.float32))
-    y, x, excess, sure = y + 1, x + 1, [], []
+    y, x, rest, inner = y + 1, x + 1, [], []
     for axis, (dy, dx) in enumerate(((1, 0), (0, 1))):
         before, after = (c, y - dy, x - dx), (c, y + dy, x + dx)
         pair = np.maximum(z[before] + z[after], 0)
-        excess.append(kappa[c, axis] * z[c, y, x] - pair - noise[c, axis])
-        sure.append(usable[before] & usable[after])
-    sharp = np.max(excess, axis=0) > 0
+        rest.append(kappa[c, axis] * z[c, y, x] - pair - noise[c, axis])
+        inner.append(usable[before] & usable[after])
+    sharp = np.max(rest, axis=0) > 0
     if not sharp.any() or (z < -SHARP_SIGMAS).sum() > sharp.sum() / 4:
         return found
-    excess, sure, at = (np.array(v)[..., sharp] for v in (excess, sure, (c, y, x)))
+    excess, sure, at = (np.array(v)[..., sharp] for v in (rest, inner, (c, y, x)))
     near = [z[k, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3].max() for k, i, j in at.T]
     found[*at] = (sure & (excess > NEIGHBOUR_PART * np.array(near))).any(axis=0)
     return found
