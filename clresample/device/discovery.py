@@ -179,8 +179,11 @@ def is_simulated(device):
     return any(name in names for name in SIMULATED)
 
 
-def driver_hints():
-    """Lines on GPU drivers of this machine that provide no device, each with its remedy."""
+def driver_hints(*, registered=True):
+    """Lines on GPU drivers of this machine that provide no device, each with its remedy.
+
+    registered: include those that the loader looks for
+    """
     try:
         found = find_devices()
     except DeviceError:
@@ -190,22 +193,18 @@ def driver_hints():
     return [
         driver_advice(vendor, path, _addresses(found))
         for vendor, path in undetected_drivers(_served(found))
+        if registered or not is_registered(path)
     ]
 
 
 @functools.cache  # once
 def warn_hidden_gpus():
     """Warns of GPU drivers that the loader does not look for, since a CPU is used instead."""
-    found = find_devices()
-    if named_library() or os.environ.get("OCL_ICD_VENDORS"):  # the user's own choice of drivers
+    if os.environ.get("OCL_ICD_VENDORS"):  # the user's own choice of drivers
         return
-    advice = []
     with suppress(OSError, ValueError):  # files that cannot be read harm nobody
-        for vendor, path in undetected_drivers(_served(found)):
-            if not is_registered(path):
-                advice.append(driver_advice(vendor, path, _addresses(found)))
-    for line in advice:
-        warnings.warn(f"{HIDDEN_GPU}: {line}", DeviceWarning, stacklevel=3)
+        for line in driver_hints(registered=False):
+            warnings.warn(f"{HIDDEN_GPU}: {line}", DeviceWarning, stacklevel=3)
 
 
 def _served(found):

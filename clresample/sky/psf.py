@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -117,10 +118,12 @@ class PSF(ReadOnly, PSFDisplay):
         """C."""
         return self.images.shape[0]
 
-    @property
+    @cached_property
     def fwhm_px(self) -> np.ndarray:
         """Width (C,) [px]: diameter of the disc that the samples above half of the peak fill."""
-        return np.array([fwhm(image) for image in self.images]) * self.spacing
+        width = np.array([fwhm(image) for image in self.images]) * self.spacing
+        width.flags.writeable = False
+        return width
 
     def __getitem__(self, bands) -> PSF:
         return self.select(bands)

@@ -173,6 +173,26 @@ def test_hot_pixels_on_a_source_are_said_and_stay():
     assert (found.blend.observations[0].weights > 0).all()
 
 
+def test_light_sharp_in_two_channels_stays():
+    data = image_of()
+    data[:, 8, 50] += 60 * NOISE
+    found = inspected([observed(data)])
+    assert any("(y, x) = (8, 50), in other channels too" in m for m in found.messages)
+    assert (found.blend.observations[0].weights > 0).all()
+
+
+def test_noise_above_that_of_the_weights_is_no_ray():
+    seen = looked_at(observed(image_of(noise=4 * NOISE)))
+    assert (seen.significance < -spoilt.SHARP_SIGMAS).any()
+    assert not spoilt.sharper_than_psf(seen).any()
+
+
+def test_equal_pixels_around_a_brighter_one_are_no_flat_top():
+    data = image_of()
+    data[0, 7:10, 49:52], data[0, 8, 50] = 900.5, 2000.5
+    assert not spoilt.saturated(looked_at(observed(data))).any()
+
+
 def test_flat_tops_are_masked_as_saturated():
     data = image_of(((DRAWN[0][0], (9e4, 9e4), 0.0), *DRAWN[1:]))
     data[1] = np.minimum(data[1], 0.6 * data[1].max())
@@ -220,6 +240,9 @@ def test_stars_of_another_width_than_the_psf_are_named(factor, word):
     star = ((DRAWN[0][0], (2e4, 2e4), 0.0),)
     o = observed(image_of(star), sigma=factor * FWHM_SIGMA)
     assert any(word in m for m in inspected([o], sources_of(star, PointSource)).messages)
+    near = PointSource(position_px=(DRAWN[0][0][0] + 10, DRAWN[0][0][1]))
+    beside = (*sources_of(star, PointSource), near)
+    assert not any(word in m for m in inspected([o], beside).messages)
 
 
 def test_channels_that_lie_apart_are_named():

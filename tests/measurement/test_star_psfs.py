@@ -54,7 +54,7 @@ def star_psfs(source=PointSource, **given):
     """Returns `with_star_psfs` of such a star listed as a kind of source, and its place."""
     observation, star = observed(**given)
     image = InspectedImage.of(observation, model_frame([observation]), star[None], np.zeros(2))
-    return *with_star_psfs(image, [source(position_px=tuple(star))], star[None], False), star
+    return *with_star_psfs(image, [source(position_px=tuple(star))], False), star
 
 
 @pytest.mark.parametrize("half_px", [30, 33])
@@ -137,7 +137,7 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(s
         psf_error=psf_error,
     )
     others = {s: _model(result, 0, np.flatnonzero(owner == s)) for s in {0, 1, 2} - {owner[star]}}
-    found = _neighbour_errors(result, 0, star, others, place)
+    found = _neighbour_errors(result, 0, star, list(others), others.get, place)
     changes = [spectra[star][:, None, None] * rendered[star]]
     if place:
         y, x = np.indices((5, 6))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -27,7 +28,7 @@ def core_errors(result) -> np.ndarray:
         return found
     for i, observation in enumerate(result.observations):
         field, channels = observation.psf_field, result.channel_slices()[i]
-        models = {s: _model(result, i, np.flatnonzero(owner == s)) for s in np.unique(owner)}
+        model = cache(lambda s, i=i: _model(result, i, np.flatnonzero(owner == s)))
         for k, star, place in _stars(result, i):
             source = owner[k]
             if star is not None:
@@ -35,27 +36,30 @@ def core_errors(result) -> np.ndarray:
                 flux = np.abs(component.spectrum[channels]) * component.morphology.sum()
                 own = field.flux_error[star] * flux
                 found[source, channels] = np.hypot(found[source, channels], own)
-            others = {s: model for s, model in models.items() if s != source}
+            others = np.unique(owner[owner != source])
             # wings that were measured do not follow from the width of a core
             is_measured = star is not None and not field.keeps_core[star]
-            errors = _neighbour_errors(result, i, k, others, None if is_measured else place)
+            place = None if is_measured else place
+            errors = _neighbour_errors(result, i, k, others, model, place)
             found[:, channels] = np.hypot(found[:, channels], errors)
     return result.psf_error * found
 
 
-def star_variance(result, i) -> np.ndarray:
-    """Variance (Co, My, Mx) [counts^2] of an observation by the errors of its stars' PSFs.
+def star_variance(result, i) -> np.ndarray | None:
+    """Variance (Co, My, Mx) [counts^2] of an observation by the errors of its stars' PSFs, or None.
 
         psf_error^2 sum over stars of L^2 + (r . grad L)^2
 
     as weights of the start have it: of light L at r from a star, of measured wings too, since a
     result that was read does not tell them.
     """
+    stars = list(_stars(result, i)) if result.psf_error else []
+    if not stars:
+        return None
     found = np.zeros(result.footprints[i].used.shape)
-    if result.psf_error:
-        for k, _, place in _stars(result, i):
-            window, changes = _star_changes(result, i, k, place)
-            found[:, *window] += result.psf_error**2 * sum(change**2 for change in changes)
+    for k, _, place in stars:
+        window, changes = _star_changes(result, i, k, place)
+        found[:, *window] += result.psf_error**2 * sum(change**2 for change in changes)
     return found
 
 
@@ -108,7 +112,7 @@ def _model(result, i, parts):
     return window, model, flux
 
 
-def _neighbour_errors(result, i, k, models, place):
+def _neighbour_errors(result, i, k, others, model_of, place):
     """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
 
         |sum_pixels w m (L, r . grad L)| / sum_pixels w m^2 flux
@@ -116,8 +120,9 @@ def _neighbour_errors(result, i, k, models, place):
 
     in observation i, for the model m of a source with this flux, of any brightness. Unlike noise,
     the star's light is too bright by psf_error, and its PSF too wide, all over m.
-    models: {s: `_model`} of the other sources; place (2,) [px]: of the star, from which r is; None
-        leaves the width out
+
+    others (n,): numbers of the other sources; model_of: returns `_model` of one
+    place (2,) [px]: of the star, from which r is; None leaves the width out
     """
     used, weights = result.footprints[i].used, result.observations[i].weights
     out = np.zeros((len(result.sources), len(weights)))
@@ -128,7 +133,8 @@ def _neighbour_errors(result, i, k, models, place):
         return out
     weights = np.where(used, weights, 0.0)
     weights[:, *own] /= lowered
-    for s, (window, model, flux) in models.items():
+    for s in others:
+        window, model, flux = model_of(s)
         here, there = intersect_boxes(*_box(window), *_box(own))
         if not changes[0][:, *there].size:
             continue

@@ -98,8 +98,9 @@ def misfit_of(result) -> Misfit:
     remainders = [remainder(result, i) for i in range(len(result.observations))]
     for i, left in enumerate(remainders):
         worst.append(left.worst(n_sources))
-        weights = result.observations[i].whitened.weights
-        noise = left.noise[:, None, None] + weights * star_variance(result, i)
+        noise, by_stars = left.noise[:, None, None], star_variance(result, i)
+        if by_stars is not None:
+            noise = noise + result.observations[i].whitened.weights * by_stars
         rest += [_of_channel(left, c, n_sources, noise[c]) for c in range(len(left.filtered))]
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
     fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own)]
@@ -111,8 +112,8 @@ def misfit_of(result) -> Misfit:
 def _of_channel(rest, c, n_sources, noise):
     """excess, chi2, light (S + 2,) of a channel of a Remainder, the last two for the whole.
 
-    noise (My, Mx): variance of its residual [sigma^2]. Pixels where that is mostly the error of
-        stars' PSFs would hide others' chi2: the larger excess with and without them counts
+    noise (My, Mx) or (1, 1) [sigma^2]: variance of its residual. Pixels where that is mostly the
+        error of stars' PSFs would hide others' chi2: the larger excess with and without them counts
     """
     used, owner = rest.used[c], rest.owner[c]
 

@@ -47,22 +47,25 @@ def centroids(image: InspectedImage) -> Centroids:
     y, x, on = image.patches(chosen, reach)
     usable = image.usable[:, y, x] & on
     light = np.where(usable, image.significance[:, y, x], 0)  # (C, n, h, h)
-    dy = y - image.places[chosen, 0, None, None]
-    dx = x - image.places[chosen, 1, None, None]
-    square = dy**2 + dx**2
-    weight = np.exp(-0.5 * square / (width**2)[:, None, None, None])
-    whole = (usable | (square > (width.max() * 1.5) ** 2)).all(axis=(2, 3))  # (C, n)
-    weighted = weight * light
-    total = weighted.sum(axis=(2, 3))
-    noise = np.sqrt((weight**2).sum(axis=(2, 3)))
+    away = np.stack([y[:, :, 0], x[:, 0]]) - image.places[chosen].T[..., None]  # (2, n, h)
+    core = away[0, :, :, None] ** 2 + away[1, :, None] ** 2 <= (width.max() * 1.5) ** 2
+    whole = (usable | ~core).all(axis=(2, 3))  # (C, n)
+    # the weight is one of y times one of x, and so are its moments
+    weight = np.exp(-0.5 * (away[:, None] / width[:, None, None]) ** 2)  # (2, C, n, h)
+    powers = np.stack([weight * away[:, None] ** k for k in range(3)], axis=-1)  # (2, C, n, h, 3)
+    moments = powers[0].swapaxes(-1, -2) @ light @ powers[1]  # (C, n, 3, 3)
+    square = (weight[..., None] * powers).sum(axis=-2)  # (2, C, n, 3)
+    noise = np.sqrt(square[0, ..., 0] * square[1, ..., 0])
+    total = moments[..., 0, 0]
     good = whole & (total > BRIGHT_SIGMAS * noise)
     total = np.where(good, total, 1.0)
-    first = np.stack([(weighted * d).sum(axis=(2, 3)) for d in (dy, dx)], axis=-1)
-    second = (weighted * square).sum(axis=(2, 3)) / (2 * total)
+    first = np.stack([moments[..., 1, 0], moments[..., 0, 1]], axis=-1)
+    second = (moments[..., 2, 0] + moments[..., 0, 2]) / (2 * total)
     response = 1 - second / (width**2)[:, None]
     good &= response > MIN_RESPONSE
     response = np.where(good, response, 1.0)
-    error = np.sqrt((weight**2 * square).sum(axis=(2, 3)) / 2) / total / response
+    spread = square[0, ..., 2] * square[1, ..., 0] + square[0, ..., 0] * square[1, ..., 2]
+    error = np.sqrt(spread / 2) / total / response
     error = np.where(good, np.hypot(error, FLOOR_PX), np.inf)
     offsets = first / (total * response)[..., None]
     return Centroids(chosen, offsets.swapaxes(0, 1), error.T)

@@ -41,13 +41,12 @@ HIDDEN = 0.02
 class ImagePlane:
     """One channel of an InspectedImage.
 
-    data (My, Mx) [counts]: above the sky, 0 where not usable; usable (My, Mx): bool
-    sigma [counts]; psf: PSF of one band; matrix, offset: as those of InspectedImage
+    data (My, Mx) [sigma of a typical pixel]: above the sky, 0 where not usable; float32
+    usable (My, Mx): bool; psf: PSF of one band; matrix, offset: as those of InspectedImage
     """
 
     data: np.ndarray
     usable: np.ndarray
-    sigma: float
     psf: PSF
     matrix: np.ndarray
     offset: np.ndarray
@@ -56,9 +55,9 @@ class ImagePlane:
     def of(cls, image, c) -> ImagePlane:
         """Channel c of an InspectedImage."""
         usable = image.usable[c]
-        data = np.where(usable, image.observation.data[c] - image.level[c], 0)
+        data = np.where(usable, image.observation.data[c] - image.level[c], 0) / image.sigma[c]
         psf = image.observation.psf[c]
-        return cls(data, usable, image.sigma[c], psf, image.matrix, image.offset)
+        return cls(data.astype(np.float32), usable, psf, image.matrix, image.offset)
 
 
 def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, np.ndarray]:
@@ -80,16 +79,25 @@ def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, n
     good = other.usable & ((at >= 0) & (at <= top)).all(axis=0) & ~there.hidden
     if smear.hidden.any():
         good &= map_coordinates(smear.hidden.astype(np.float32), at, order=1, mode="nearest") < 0.5
-    good &= _within(shape, near, radius)
+    about = _within(shape, near, radius)
+    good &= about
     if good.sum() < MIN_PIXELS + 3 * len(places):
         return np.zeros((len(places), 2)), np.full(len(places), np.inf)
     owner = _nearest(one.data.shape, places @ one.matrix.T + one.offset)
+    # with a pixel more on each side, from which slopes follow
+    window = tuple(
+        slice(max(lit[0] - 1, 0), lit[-1] + 2)
+        for lit in (np.flatnonzero(about.any(axis=axis)) for axis in (1, 0))
+    )
+    near = near - [part.start for part in window]
+    lights = (one.data * (owner == s) for s in range(len(places)))
+    options = {"order": 3, "mode": "constant", "prefilter": False, "output": float}
     images = [
-        area * map_coordinates(smear.of(one.data * (owner == s)), at, order=3, mode="constant")
-        for s in range(len(places))
+        area * map_coordinates(smear.of(light, spline=True), at[:, *window], **options)
+        for light in lights
     ]
-    noise = other.sigma, one.sigma * np.sqrt(area)
-    shifts, errors, brightness = _solved(images, there.of(other.data), good, noise)
+    there = there.of(other.data)[window].astype(float)
+    shifts, errors, brightness = _solved(images, there, good[window], np.sqrt(area))
     parts = np.array([_foreign(images, brightness, s, near[s], radius) for s in range(len(near))])
     return shifts, np.hypot(errors, COLOUR * parts * radius)
 
@@ -125,13 +133,14 @@ def _nearest(shape, places):
 def _solved(images, there, good, noise):
     """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources in the image `there`.
 
-    Computed from the good pixels of the sources' images (n); noise: of a pixel of either image.
+    Computed from the good pixels of the sources' images (n), whose noise is `noise`; that of
+    `there` is 1.
     """
     n = len(images)
     light = np.stack([image[good] for image in images])
     slopes = np.stack([[s[good] for s in np.gradient(image)] for image in images])  # (n, 2, P)
     value = there[good]
-    a = _brightness(light, value, noise[0])
+    a = _brightness(light, value)
     moving = -(a[:, None, None] * slopes).reshape(2 * n, -1)
     design = np.vstack([np.ones_like(value), light, moving])
     scale = np.maximum(np.sqrt((design**2).sum(axis=1)), 1e-300)
@@ -140,7 +149,7 @@ def _solved(images, there, good, noise):
     inverse = np.linalg.inv(normal + RIDGE * np.eye(len(normal)))
     solution = inverse @ (design @ value)
     rest = value - solution @ design
-    variance = noise[0] ** 2 + (np.abs(a).max() * noise[1]) ** 2
+    variance = 1 + (np.abs(a).max() * noise) ** 2
     variance = max(variance, (rest @ rest) / max(value.size - len(solution), 1))
     shifts = (solution / scale)[1 + n :].reshape(n, 2)
     errors = np.sqrt(variance * np.diag(inverse)) / scale
@@ -149,15 +158,15 @@ def _solved(images, there, good, noise):
     return shifts, errors, a
 
 
-def _brightness(light, value, sigma):
-    """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), noise sigma.
+def _brightness(light, value):
+    """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), noise 1.
 
     Sources that cannot be separated share their total brightness.
     """
     total = np.stack([np.ones_like(value), light.sum(axis=0)])
     background, mean = np.linalg.lstsq(total.T, value, rcond=None)[0]
     rest = value - background - mean * total[1]
-    normal = light @ light.T + (sigma / max(abs(mean), 1e-300)) ** 2 * np.eye(len(light))
+    normal = light @ light.T + max(abs(mean), 1e-300) ** -2 * np.eye(len(light))
     return mean + np.linalg.solve(normal, light @ rest)
 
 
@@ -177,13 +186,21 @@ class Blur:
         size = [fft.next_fast_len(max(n + reach, side), real=True) for n in plane.data.shape]
         padded = np.zeros(size)
         padded[:side, :side] = fft.fftshift(kernel)
-        self._transfer = fft.rfft2(np.roll(padded, (-reach, -reach), (0, 1)))
+        padded = np.roll(padded, (-reach, -reach), (0, 1)).astype(np.float32)
+        self._transfer = fft.rfft2(padded)
         self._size, self._inside = size, tuple(slice(n) for n in plane.data.shape)
         self.hidden = np.zeros(plane.data.shape, bool)
         if not plane.usable.all():
             self.hidden = self.of(~plane.usable) > HIDDEN
 
-    def of(self, image):
-        """An image (My, Mx) convolved, without light from beyond its edges."""
-        transform = fft.rfft2(np.asarray(image, float), self._size) * self._transfer
+    def of(self, image, spline=False):
+        """An image (My, Mx) convolved, without light from beyond its edges.
+
+        spline: coefficients of the cubic B-splines through its pixels instead
+        """
+        transform = fft.rfft2(np.asarray(image, np.float32), self._size) * self._transfer
+        if spline:
+            n_y, n_x = self._size
+            at_pixels = (2 + np.cos(2 * np.pi * fft.fftfreq(n_y))[:, None]) / 3
+            transform /= at_pixels * (2 + np.cos(2 * np.pi * fft.rfftfreq(n_x))) / 3
         return fft.irfft2(transform, self._size)[self._inside]

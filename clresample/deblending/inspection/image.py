@@ -29,6 +29,7 @@ class InspectedImage:
     sigma (C,) [counts]: noise of a typical pixel, 1 of channels without a weight
     level (C,) [counts]: of the sky; 0 before `levels.sky_level`
     places (S, 2) [px]: of the sources; inside (S,): bool, those on a pixel of the image
+    listed (S, 2) [px]: of the sources without the observation's shift
     matrix (2, 2), offset (2,): p = matrix X + offset, from model pixels to observed ones
     """
 
@@ -38,6 +39,7 @@ class InspectedImage:
     level: np.ndarray
     places: np.ndarray
     inside: np.ndarray
+    listed: np.ndarray
     matrix: np.ndarray
     offset: np.ndarray
 
@@ -47,13 +49,13 @@ class InspectedImage:
 
         Its sources are at `positions` (S, 2) [model px] of a Frame.
         """
-        corner = np.maximum(np.array(frame.shape) - 1.0, 1.0)
-        points = np.concatenate([LATTICE * corner, positions - shift])
+        lattice = LATTICE * np.maximum(np.array(frame.shape) - 1.0, 1.0)
+        points = np.concatenate([lattice, positions - shift, positions])
         found = frame.grid.positions_in(observation.grid, *points.T)
-        lattice, places = np.split(found, [len(LATTICE)])
-        design = np.column_stack([LATTICE * corner, np.ones(len(LATTICE))])
-        good = np.isfinite(lattice).all(axis=1)
-        solution = np.linalg.lstsq(design[good], lattice[good], rcond=None)[0]
+        found, places, listed = np.split(found, [len(lattice), len(lattice) + len(positions)])
+        design = np.column_stack([lattice, np.ones(len(lattice))])
+        good = np.isfinite(found).all(axis=1)
+        solution = np.linalg.lstsq(design[good], found[good], rcond=None)[0]
         shape = np.array(observation.data.shape[1:])
         with np.errstate(invalid="ignore"):
             inside = np.all((places >= -0.5) & (places < shape - 0.5), axis=1)
@@ -63,7 +65,7 @@ class InspectedImage:
         matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0  # upright grids stay upright
         offset = solution[2] - matrix @ shift
         level = np.zeros(len(sigma))
-        return cls(observation, usable, sigma, level, places, inside, matrix, offset)
+        return cls(observation, usable, sigma, level, places, inside, listed, matrix, offset)
 
     def over(self, level) -> InspectedImage:
         """The same InspectedImage with the level (C,) [counts] of its sky known."""

@@ -84,8 +84,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        there = frame.grid.positions_in(observation.grid, *positions[near].T)
-        image, wide, own = with_star_psfs(image, sources, there, settings.fit_sky)
+        image, wide, own = with_star_psfs(image, sources, settings.fit_sky)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         if wide.any():

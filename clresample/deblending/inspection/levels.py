@@ -71,10 +71,12 @@ def sky_level(image) -> SkyLevel:
         level, wing, variance = _fitted(means, wings[1], white, kept)
         model = level[:, None] + wing[:, None] * wings[1]
         spread = _spread(means - model, white, none, kept)
-        kept = dark & (np.abs(means - model) < CLIP * spread)
+        before, kept = kept, dark & (np.abs(means - model) < CLIP * spread)
+        if (kept == before).all():
+            break
     scale = (spread / white).max(axis=1)
-    ends = [_fitted(means, wings[k], white, kept)[0] for k in (0, 2)]
-    unsure = np.abs(ends[1] - ends[0]) / 2
+    steep, shallow = _fitted(means, wings[[0, 2]], white, kept)[0]
+    unsure = np.abs(steep - shallow) / 2
     enough = kept.sum(axis=1) >= MIN_BLOCKS
     rim, rim_error = _rim(means, white, known & (darker < RIM))
     return SkyLevel(
@@ -98,6 +100,8 @@ def _rim(means, white, kept):
         middle = _middle(means, kept)
         spread = _spread(means, white, middle, kept)
         near = kept & (np.abs(means - middle[:, None]) < CLIP * spread)
+        if (near == kept).all():
+            break
         kept = np.where(near.sum(axis=1, keepdims=True) >= MIN_BLOCKS // 2, near, kept)
     number = kept.sum(axis=1)
     known = number >= MIN_BLOCKS // 2
@@ -133,7 +137,7 @@ def _blocks(image):
 def _darker(image, centers, wings):
     """Rank (B,) of the blocks by the light of wings (C, B) in them, from 0, the darkest, to 1.
 
-    Infinite of those in a source, where this leaves enough others.
+    Infinite of those in a source.
     """
     light = (wings / image.sigma[:, None]).sum(axis=0) if len(wings) else np.zeros(len(centers))
     free = np.ones(len(centers), bool)
@@ -141,8 +145,6 @@ def _darker(image, centers, wings):
     if len(places):
         squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
         free = squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
-    if free.sum() < 2 * MIN_BLOCKS:
-        free[:] = True
     rank = np.full(len(centers), np.inf)
     order = np.argsort(light[free], kind="stable")
     rank[np.flatnonzero(free)[order]] = np.arange(len(order)) / max(len(order), 1)
@@ -161,17 +163,18 @@ def _wings(image, means, centers):
     light = means[:, squares.argmin(axis=0)] - np.median(means, axis=1, keepdims=True)
     light = np.maximum(light, image.sigma[:, None] * 1e-3)  # undetected sources have no wings
     core = max(image.width_px, 1.0) ** 2
-    return np.stack([light @ (1 + squares / core).T ** (-p / 2) for p in POWERS])
+    return light @ np.exp(-0.5 * np.array(POWERS)[:, None, None] * np.log1p(squares / core).T)
 
 
 def _fitted(means, wings, white, kept):
-    """Level and wing (C,) by least squares with wing >= 0, and the level's variance (C,).
+    """Level and wing (..., C) by least squares with wing >= 0, and the level's variance (..., C).
 
-    The blocks have noise `white`.
+    wings (..., C, B); the blocks have noise `white`.
     """
     weight = kept / white**2
-    a, b, c = weight.sum(1), (weight * wings).sum(1), (weight * wings**2).sum(1)
-    d, e = (weight * means).sum(1), (weight * wings * means).sum(1)
+    weighted = weight * wings
+    a, b, c = weight.sum(-1), weighted.sum(-1), (weighted * wings).sum(-1)
+    d, e = (weight * means).sum(-1), (weighted * means).sum(-1)
     a = np.maximum(a, 1e-300)
     determinant = a * c - b * b
     solvable = determinant > 1e-6 * a * c

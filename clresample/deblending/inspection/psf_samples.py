@@ -12,6 +12,7 @@ PHASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
 # Contrast is that of a PSF narrower by this factor, so that no star's core is masked as a cosmic
 # ray: PSFs are measured to a few percent, and those of other exposures or filters differ by more.
 NARROWER = 1.25
+N_ANGLES = 16  # of the circles over which a PSF is averaged
 
 
 def psf_at(psf, band, y, x) -> np.ndarray:
@@ -24,6 +25,14 @@ def psf_at(psf, band, y, x) -> np.ndarray:
     along_y = np.sinc((np.asarray(y) / psf.spacing + y0)[:, None] - np.arange(n_y))
     along_x = np.sinc((np.asarray(x) / psf.spacing + x0)[:, None] - np.arange(n_x))
     return along_y @ image @ along_x.T
+
+
+def ring_mean(psf, band, radius) -> float:
+    """Mean value [1] of a band of a PSF on a circle of this radius [px] about its centre."""
+    angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
+    return float(
+        np.diag(psf_at(psf, band, radius * np.sin(angles), radius * np.cos(angles))).mean()
+    )
 
 
 def inscribed_radius(psf, band) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation, label
 
-from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from .psf_samples import pair_ratios
 
 # [sigma] Smallest brightness of a plateau: noise in images of integers has faint plateaus.
@@ -19,9 +18,6 @@ GROW_PX = 2
 SHARP_SIGMAS = 6.0
 # Uncertainty of a pixel in units of the brightest pixel nearby: PSFs are accurate to a few percent.
 NEIGHBOUR_PART = 0.05
-# Contrast of PSF images with more of their transform at their frequency limit
-# (psf_checks.LIMIT_TOLERANCE), in units of the computed one: their interpolation has such errors.
-COARSE_PART = 0.5
 
 
 def saturated(image) -> np.ndarray:
@@ -95,36 +91,23 @@ def sharper_than_psf(image) -> np.ndarray:
     negative, because the noise is then larger than the weights imply. Pixels beside unusable ones
     and on the edge are not selected.
     """
-    z, psf = image.significance, image.observation.psf
-    ratios = pair_ratios(psf)
-    ratios = np.where(
-        limit_power(psf.images)[:, None] > LIMIT_TOLERANCE, COARSE_PART * ratios, ratios
-    )
+    z, usable = image.significance, image.usable
     found = np.zeros(z.shape, bool)
-    inner = z[:, 1:-1, 1:-1]
-    pairs = (z[:, :-2, 1:-1] + z[:, 2:, 1:-1], z[:, 1:-1, :-2] + z[:, 1:-1, 2:])
-    for axis, pair in enumerate(pairs):
-        kappa = ratios[:, axis].astype(np.float32)[:, None, None]
-        noise = SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
-        found[:, 1:-1, 1:-1] |= kappa * inner > np.maximum(pair, 0) + noise
-    found &= image.usable
-    if not found.any() or (z < -SHARP_SIGMAS).sum() > found.sum() / 4:
-        return np.zeros_like(found)
-    return _confirmed(image, found, ratios)
-
-
-def _confirmed(image, found, ratios):
-    """Selects found pixels (C, My, Mx) between usable ones that are sharper than the PSF.
-
-    They stay sharper with the uncertainty of the PSF in the light beside them.
-    """
-    z, sure = image.significance, np.zeros_like(found)
-    for c, y, x in np.argwhere(found):
-        near = z[c, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
-        doubt = NEIGHBOUR_PART * near.max()
-        for kappa, (dy, dx) in zip(ratios[c], ((1, 0), (0, 1)), strict=True):
-            both = [(c, y - dy, x - dx), (c, y + dy, x + dx)]
-            if all(image.usable[at] for at in both):
-                least = max(z[both[0]] + z[both[1]], 0) + SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
-                sure[c, y, x] |= kappa * z[c, y, x] > least + doubt
-    return sure
+    kappa = pair_ratios(image.observation.psf)
+    noise = SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
+    with np.errstate(divide="ignore"):
+        least = (noise / kappa).min(axis=1)  # beside pixels without light
+    c, y, x = np.nonzero(z[:, 1:-1, 1:-1] > least[:, None, None].astype(np.float32))
+    y, x, rest, inner = y + 1, x + 1, [], []
+    for axis, (dy, dx) in enumerate(((1, 0), (0, 1))):
+        before, after = (c, y - dy, x - dx), (c, y + dy, x + dx)
+        pair = np.maximum(z[before] + z[after], 0)
+        rest.append(kappa[c, axis] * z[c, y, x] - pair - noise[c, axis])
+        inner.append(usable[before] & usable[after])
+    sharp = np.max(rest, axis=0) > 0
+    if not sharp.any() or (z < -SHARP_SIGMAS).sum() > sharp.sum() / 4:
+        return found
+    excess, sure, at = (np.array(v)[..., sharp] for v in (rest, inner, (c, y, x)))
+    near = [z[k, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3].max() for k, i, j in at.T]
+    found[*at] = (sure & (excess > NEIGHBOUR_PART * np.array(near))).any(axis=0)
+    return found

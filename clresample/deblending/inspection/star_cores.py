@@ -14,7 +14,7 @@ from scipy.ndimage import (
 )
 from scipy.optimize import minimize
 
-from .psf_samples import inscribed_radius, psf_at
+from .psf_samples import inscribed_radius, ring_mean
 
 # [FWHM of the PSF] Smallest radius of the largest disc inside the masked pixels of a core: narrower
 # masks are bad columns and cosmic rays.
@@ -139,15 +139,11 @@ def _guesses(light, usable, masked):
 
 def _ring_about(light, usable, masked, guess, fwhm):
     """The place (2,) [px] of a core, its ring, inner radius and scatter; None without a ring."""
-    top = np.array(light.shape) - 1
     for _ in range(2):  # ring and position depend on each other
-        at = tuple(np.clip(np.rint(guess).astype(int), 0, top))
-        if not masked[at] and not binary_dilation(masked, np.ones((3, 3), bool))[at]:
-            return None
         ring, inner = _ring(usable, masked, guess, fwhm)
         if ring is None:
             return None
-        guess, scatter = _centred(light, ring, guess, fwhm)
+        guess, scatter = _centred(light, ring, guess)
     return guess, ring, inner, scatter
 
 
@@ -175,7 +171,7 @@ def _reach_of(masked, away):
     return float(away[~masked].min(initial=away.max()))
 
 
-def _centred(light, ring, guess, fwhm):
+def _centred(light, ring, guess):
     """Fits the centre (2,) [px] of a ring of light; also returns the scatter about it.
 
     The scatter is the mean deviation of the light's logarithm from a function of the radius.
@@ -185,14 +181,12 @@ def _centred(light, ring, guess, fwhm):
 
     def scatter(place):
         away = np.hypot(y - place[0], x - place[1])
-        order = np.polynomial.polynomial.Polynomial.fit(away, value, 2)
-        return np.abs(value - order(away)).mean()
+        powers = np.vander(away - away.mean(), 3)
+        return np.abs(value - powers @ np.linalg.lstsq(powers, value, rcond=None)[0]).mean()
 
     found = minimize(
         scatter, guess, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 1e-4, "maxiter": 80}
     )
-    if np.hypot(*(found.x - guess)) > 2 * fwhm:
-        return guess, scatter(guess)
     return found.x, float(found.fun)
 
 
@@ -209,11 +203,7 @@ def _falls_like(light, ring, place, psf, band, fwhm):
     falls, reach = bool(bright[1] < bright[0]), inscribed_radius(psf, band)
     is_large = reach >= MIN_WINGS_FWHM * fwhm
     inside = radii * min(1.0, reach / radii[1]) if is_large else radii
-    angles = np.arange(16) * np.pi / 8
-    own = [
-        np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
-        for r in inside
-    ]
+    own = [ring_mean(psf, band, r) for r in inside]
     if not min(own) > 0 or not (is_large or own[0] > own[1]):
         return falls
     return (is_large or falls) and bool(bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0])

@@ -31,7 +31,7 @@ from ...sky.psf import PSF
 from ...sky.sources import ExtendedSource, PointSource
 from ...sky.varying_psf.field import PSFField
 from .image import SIGMAS_A_FWHM
-from .psf_samples import inscribed_radius, psf_at
+from .psf_samples import inscribed_radius, psf_at, ring_mean
 from .spoilt import GROW_PX
 from .star_cores import star_cores
 from .star_profile import RadialProfile
@@ -66,7 +66,6 @@ MIN_HALO_SIGMAS = 0.25
 MAX_HALO_SAMPLES = 1200
 # [1] Largest ratio of a halo to the PSF at the edge of its image: more light is of galaxies.
 MAX_HALO_RATIO = 2.0
-N_ANGLES = 16  # of the rings over which a PSF image is averaged
 MIN_USABLE_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 
 
@@ -105,7 +104,7 @@ class StarPSFs(PSFField):
         return self.psf if self.field is None else self.field.psf_at(y, x)
 
 
-def with_star_psfs(image, sources, places, sky):
+def with_star_psfs(image, sources, sky):
     """The InspectedImage with own PSFs for masked stars, and two numbers of channels (S,) of each.
 
     Those in which it has a wide core, from MIN_STAR_RADIUS_FWHM, and those of them in which it does
@@ -114,8 +113,7 @@ def with_star_psfs(image, sources, places, sky):
     The masked pixels of wide cores grow by WIDE_GROW_PX, of others by `spoilt.GROW_PX`; see
     `StarCore.grown`. Without any core the image is returned unchanged.
 
-    sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
-    sky: True if a sky level is fitted
+    sources: those of `image.places`; sky: True if a sky level is fitted
     """
     stars = [i for i, source in enumerate(sources) if _may_be_star(source) and image.inside[i]]
     found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
@@ -144,13 +142,13 @@ def with_star_psfs(image, sources, places, sky):
     if not found:
         return image, n_wide, n_own
     o, numbers = image.observation, sorted(found)
-    psfs = tuple(_combine_psfs(_listed_psf(o, places[i]), found[i]) for i in numbers)
+    psfs = tuple(_combine_psfs(_listed_psf(o, image.listed[i]), found[i]) for i in numbers)
     flux_error = np.zeros((len(numbers), len(grown)))
     for k, i in enumerate(numbers):
         for c, measured in found[i].items():
             flux_error[k, c] = measured.flux_error
     keeps_core = n_own[numbers] == 0
-    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, flux_error, keeps_core)
+    field = StarPSFs(o.psf, o.psf_field, image.listed[numbers], psfs, flux_error, keeps_core)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_wide, n_own
 
 
@@ -341,9 +339,7 @@ def _scale(psf, band, profile, radius):
     end = min(radius, inscribed_radius(psf, band))
     if end < 1:
         return None
-    angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
-    places = [([end * np.sin(t)], [end * np.cos(t)]) for t in angles]
-    ring = np.mean([psf_at(psf, band, y, x)[0, 0] for y, x in places])
+    ring = ring_mean(psf, band, end)
     return float(profile.at(end)) / ring if ring > 0 else None
 
 
