@@ -208,6 +208,24 @@ class Device:
             self.finish()
         return event
 
+    def repeat(self, steps):
+        """Queues the steps of a LaunchList once more.
+
+        They are (kernel, arguments, global and local size), or (None, function, arguments, None).
+        """
+
+        def queue_all():
+            enqueue, queue, lock = self._enqueue, self.queue, self._lock
+            for kernel, values, global_size, local_size in steps:
+                if kernel is None:
+                    values(*global_size)
+                    continue
+                with lock:
+                    kernel.set_args(*values)
+                    enqueue(queue, kernel, global_size, local_size)
+
+        self._call(queue_all)
+
     def finish(self, queue=None):
         """Waits until all queued work is done, here or in another in-order queue."""
         import pyopencl as cl

@@ -184,7 +184,8 @@ def test_inner_products_are_those_of_each_scene(build, dtype, with_blocks):
     exchanges = random_exchanges(m) if with_blocks else []
     m.steps.take_blocks(source_blocks(blocks), exchanges)
     x, g, s, hy = (m.host[k] for k in ("x", "g", "s", "hy"))
-    sums, slope, energy = m.steps.change()
+    m.steps.queue_products()
+    sums, slope, energy = m.steps.products()
     on = m.scene < 2
     y = np.where(on, m.host["g_new"] - g, 0)
     s, hy = s.copy(), hy.copy()
@@ -216,7 +217,7 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     scale, length = rng.uniform(0.5, 1, (2, 3))
     blocks, exchanges = random_blocks(m), random_exchanges(m)
     m.steps.take_blocks(source_blocks(blocks), exchanges)
-    m.steps.change()
+    m.steps.queue_products()
     x, g, hg, d, s, hy = (m.get(k) for k in ("x", "g", "hg", "d", "s", "hy"))
     m.follow([mode, mode, REST])
     m.steps.advance(a, c, scale, length)
@@ -242,7 +243,7 @@ def test_a_scene_that_is_no_number_harms_no_other(build, dtype):
         m = Made(build, dtype)
         m.steps.take_blocks(source_blocks(random_blocks(m)))
         build.upload(np.where(m.scene == 1, bad, m.host["g_new"]).astype(dtype), m.v.g_new)
-        m.steps.change()
+        m.steps.queue_products()
         m.follow([NEXT, NEXT, REST])
         m.steps.advance(*np.zeros((2, 3, 5)), *np.zeros((2, 3)))
         found.append(np.vstack([m.get("hy"), m.get("hg")])[:, m.scene == 0])

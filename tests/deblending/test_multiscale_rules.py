@@ -226,7 +226,10 @@ def test_exchange_directions_are_renewed_and_earlier_pairs_dropped():
     )
     one.states = lambda which: which
     one.steps = SimpleNamespace(take_blocks=lambda *given: taken.append(given))
+    forgotten = []
+    one._trial = SimpleNamespace(forget=lambda: forgotten.append(len(taken)))
     one._precondition()
+    assert forgotten == [1]  # the launches of a trial are others then
     assert taken == [("blocks", [["new 0"], [], [], ["old 3"]])]
     assert one.pairs.count.tolist() == [0, 0, 1, 1]
     due[:] = False

@@ -17,6 +17,7 @@ from clresample.deblending.solver.gradient import LossGradient
 from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.rendering.stages import BoxTransformRendering
 from clresample.deblending.solver.scene_model import compose
+from clresample.device.program import LaunchList
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint, dense
@@ -118,15 +119,21 @@ def test_adjoints_pass_the_dot_test(build, name, own, depth):
 
 @pytest.mark.parametrize("name", ["mirrored", "crossed", "30 degrees"])
 def test_gradients_are_the_same_at_every_depth(build, name):
-    """Of all free sources; what is fixed, and what lies between boxes, stays as it was."""
+    """Of all free sources, also when their launches are repeated at other spectra.
+
+    What is fixed, and what lies between boxes, stays as it was.
+    """
     if not build.has_fp64:
         pytest.skip(f"{build.name} has no double precision")
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64, own=True), []
-    for depth in (0, 1, 2):
+    for depth, repeated in ((0, False), (0, True), (1, True), (2, True)):
         b = buffers_of(pairs, build, np.float64)
         gradient = LossGradient(b, depth=depth)
-        gradient.queue()
-        gradient.queue()  # what is added to is written first
+        queue, spectra = gradient.queue, build.get(b.spectra)
+        queue = LaunchList(build, queue) if repeated else queue
+        for factor in (2, 1):
+            build.upload(factor * spectra, b.spectra)
+            queue()  # what is added to is written first
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
         found.append([build.get(array) for array in arrays])
     for other in found[1:]:

@@ -87,7 +87,7 @@ def test_scenes_look_when_they_are_calm_and_settled():
 def test_scenes_that_still_fall_far_look_after_eighty_rounds():
     progress = begun(100, 100, 100, 100)
     progress.settled[:] = True
-    falls(progress, 20, 20, 10, np.inf)
+    falls(progress, 20, 20, 10, np.nan)  # the last one is unknown
     progress.n_rounds[:] = [79, 80, 80, 80]
     assert progress.significance_due(np.ones(4, bool)).tolist() == [False, True, False, False]
 

@@ -54,7 +54,7 @@ def test_pairs_lie_in_the_slots_that_kernels_look_at():
         pairs.take(which, np.ones((1, 4)), np.ones((1, 4)))
         n = min(n + 1, 3)
         assert pairs.count.tolist() == [0, n]
-        held = {*np.flatnonzero(pairs._valid[1]), pairs.spare[1]}
+        held = {*pairs._order[1, : n + 1]}
         assert slot in held and max(held) < pairs.used[1] == len(held) == n + 1
     assert pairs.used.tolist() == [1, 4]
 

@@ -15,6 +15,7 @@ from clresample.deblending.solver.gradient import LossGradient
 from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.rendering.windows import WindowGroups, WindowRendering
 from clresample.deblending.solver.scene_model import compose
+from clresample.device.program import LaunchList
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
 
@@ -101,14 +102,17 @@ def test_a_window_at_the_wrong_place_is_found(device):
 
 @every_geometry
 def test_gradients_are_those_of_frames(build, name):
-    """Of the free sources; fixed ones stay as they were."""
+    """Of the free sources, also of repeated launches; fixed ones stay as they were."""
     if not build.has_fp64:
         pytest.skip(f"{build.name} has no double precision")
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64), []
     for depth in (0, 3):
         b = buffers_of(pairs, build, np.float64)
-        gradient = LossGradient(b, depth=depth)
-        gradient.queue()
+        gradient, spectra = LossGradient(b, depth=depth), build.get(b.spectra)
+        queue = LaunchList(build, gradient.queue) if depth else gradient.queue
+        for factor in (2, 1):
+            build.upload(factor * spectra, b.spectra)
+            queue()
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
         found.append([build.get(array) for array in arrays])
     for a, b in zip(*found, strict=True):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....device.program import LaunchList
 from ..buffers import SceneBuffers
 from ..gradient import LossGradient
 from ..scene import State, StructureState
@@ -72,6 +73,7 @@ class MultiscaleEngine:
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
         self.steps.take_blocks(self.strengths.schedule.blocks, self._exchanges)
+        self._trial = LaunchList(device, self._queue_trial)
 
     def subset(self, keep):
         """An engine of the scenes `keep` (n,) alone, which continue unchanged."""
@@ -118,17 +120,23 @@ class MultiscaleEngine:
             self.pairs.forget(exchanging & moved)  # they are of another inverse curvature
         if blocks is not None:
             self.steps.take_blocks(blocks, self._exchanges)
+            self._trial.forget()
 
     def _evaluate(self):
         """Inner products, slopes and losses at the trials."""
+        self._trial()
+        sums, slope, energy, rows = self.steps.products(self._gradient.rows_loss)
+        return sums, slope, rows.sum(1, dtype=np.float64) + 0.5 * energy
+
+    def _queue_trial(self):
+        """Queues gradients, losses and inner products at the trials."""
         v, gradient = self.vectors, self._gradient
         self.structure.form(v.x_new)
         v.unpack_spectra(v.x_new)
         gradient.queue()
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
         v.pack_gradients(gradient.rows_pull, self._row0)
-        sums, slope, energy, rows = self.steps.change(gradient.rows_loss)
-        return sums, slope, rows.sum(1, dtype=np.float64) + 0.5 * energy
+        self.steps.queue_products()
 
     def _clear(self, asking):
         """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""
@@ -155,7 +163,8 @@ class MultiscaleEngine:
         for i, found in enumerate(self.strengths.findings(settled, energies, spectra)):
             if found is not None:
                 self.progress.n_determined[i] = found.n_effective.sum()
-        return self.steps.change()[0]  # its s and y go into spare slots
+        self.steps.queue_products()  # their s and y go into spare slots
+        return self.steps.products()[0]
 
     def _rest_others(self, live):
         """Restricts the launches that follow to the scenes `live` (B,)."""
@@ -201,6 +210,7 @@ class MultiscaleEngine:
     def update_shifts(self, moved):
         """Copies the current shifts of the operators of the scenes `moved` (B,)."""
         self._gradient.update_shifts()
+        self._trial.forget()
         self.progress.refresh_loss(moved)
         self._queue(np.where(moved, STAY, REST), 0.0)
 

@@ -98,8 +98,8 @@ class LbfgsControl:
         self._length, self._trials = np.ones(n), np.zeros(n, int)
         self._refused = np.zeros(n, int)  # the round of the last rejected trial of its own
         self._external = np.zeros(n, bool)  # the trial is along an external step
-        # the last losses, the present one first
-        self._losses = np.full((n, 4 * CONVERGENCE_WINDOW + 1), np.inf)
+        # the last losses, the present one first; NaN before the first one
+        self._losses = np.full((n, 4 * CONVERGENCE_WINDOW + 1), np.nan)
 
     def take(self, keep):
         """The LbfgsControl of the scenes `keep` (n,) alone."""
@@ -115,17 +115,17 @@ class LbfgsControl:
         slope (B,): g . (x_new - x)
         """
         self.n_rounds += self.live
-        finite = np.isfinite(loss)
-        self.failed |= self.live & self._fresh & ~finite
+        finite, fresh = np.isfinite(loss), self._fresh
+        self.failed |= self.live & fresh & ~finite
         self.live &= ~self.failed
         with np.errstate(invalid="ignore"):
             lower = (slope < 0) & (loss <= self.loss + ARMIJO * slope)
             shrink = -slope / (2 * np.maximum(loss - self.loss - slope, 1e-30))
-        self._shrink = np.clip(np.where(np.isfinite(shrink), shrink, 0), *SHRINK)
+        self._shrink = np.where(np.isfinite(shrink), shrink, 0).clip(*SHRINK)
         self._uphill = ~(slope < 0)
-        accepted = self.live & finite & (lower | self._fresh)
-        stepped = accepted & ~self._fresh
-        self._losses[stepped] = np.roll(self._losses[stepped], 1, axis=1)
+        accepted = self.live & finite & (lower | fresh)
+        stepped = accepted & ~fresh
+        self._losses[stepped, 1:] = self._losses[stepped, :-1]
         self.n_iterations += stepped
         self._losses[accepted, 0] = self.loss[accepted] = loss[accepted]
         self._fresh &= ~accepted
@@ -146,7 +146,7 @@ class LbfgsControl:
         """Selects scenes (B,) to be tested now for significant structure."""
         fall, chi2 = self._fallen(LOSS_WINDOW), self.chi2()
         calm = fall < max(SIGNIFICANCE_LOSS_DROP, 2 * self.loss_tol) * chi2
-        far = (self.n_rounds >= LATE_LOOK) & (fall > FALLING * chi2) & np.isfinite(fall)
+        far = (self.n_rounds >= LATE_LOOK) & (fall > FALLING * chi2)
         misfit = self.loss > MAX_LOSS * self._n_pixels
         return accepted & self.settled & ~self.tested & (calm | far | misfit)
 
@@ -168,7 +168,7 @@ class LbfgsControl:
         self.loss += np.where(due, change, 0)
         self.settled |= due & (moved < MAX_LOG_STRENGTH_CHANGE)
         self._due[due] = self.n_rounds[due] + STRENGTH_ROUNDS
-        self._losses[due, 0], self._losses[due, 1:] = self.loss[due], np.inf
+        self._losses[due, 0], self._losses[due, 1:] = self.loss[due], np.nan
 
     def refresh_loss(self, which):
         """Marks the losses of scenes `which` (B,) as changed.
@@ -177,7 +177,7 @@ class LbfgsControl:
         """
         self._fresh |= which
         self._bare &= ~which
-        self._losses[which, 1:] = np.inf
+        self._losses[which, 1:] = np.nan
         self._call_back(which)
 
     def resume(self, which):
@@ -234,14 +234,11 @@ class LbfgsControl:
         With the n before as a geometric series it falls by less than `remainder` (B,) later.
         """
         fall, both = self._fallen(n), self._fallen(2 * n)
-        with np.errstate(invalid="ignore"):
-            slows = fall**2 < remainder * (both - 2 * fall)
-        return (fall < most) & slows & np.isfinite(both)  # all losses of both windows are known
+        return (fall < most) & (fall**2 < remainder * (both - 2 * fall))
 
     def _fallen(self, n):
-        """Decrease of the losses (B,) over the last n iterations."""
-        with np.errstate(invalid="ignore"):  # scenes without a loss so far
-            return self._losses[:, n] - self._losses[:, 0]
+        """Decrease of the losses (B,) over the last n iterations, NaN where there were fewer."""
+        return self._losses[:, n] - self._losses[:, 0]
 
     def chi2(self):
         """chi2 per pixel (B,), at least 1."""

@@ -33,7 +33,7 @@ class LbfgsSteps:
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._levels, self._directions = [], None
+        self._levels, self._directions, self._directions_of = [], None, None
         self.shelf = shelf or FactorStore(b.device, b.dtype)
         self._sent = []  # events of uploads that may be on their way
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
@@ -94,20 +94,16 @@ class LbfgsSteps:
 
     def follow(self, pairs, mode):
         """Uploads the mode (B,) of each scene, REST, NEXT, ..., and the slots of its pairs."""
-        plan = np.stack([mode, pairs.used, pairs.spare], axis=1)
-        self._send(np.ascontiguousarray(plan, np.int32), self._plan)
+        plan = np.empty(self._plan.shape, np.int32)
+        plan[:, 0], plan[:, 1], plan[:, 2] = mode, pairs.used, pairs.spare
+        self._send(plan, self._plan)
 
     def _send(self, values, array):
         """Queues an upload that ends before the next sums come back."""
         self._sent.append(self._buffers.device.upload(values, array, wait=False))
 
-    def change(self, *others):
-        """Inner products of trials; s and H y go into the spare slots.
-
-        s_k . P g, H y_k . P g, s_k . y, H y_k . y (B, slots, 4), g . s (B,), x_new . precision
-        x_new (B,); for idle scenes the former values. Then the values of `others`, device arrays
-        that are read in the same wait.
-        """
+    def queue_products(self):
+        """Queues the inner products of trials; s and H y go into the spare slots."""
         self._trial(self._size)
         for size, given in self._levels:
             self._invert(size, **given)
@@ -116,6 +112,13 @@ class LbfgsSteps:
             self._multiply_directions(by_direction)
             self._add_directions(by_variable)
         self._change(self._size)
+
+    def products(self, *others):
+        """The inner products last queued, for idle scenes the former ones.
+
+        s_k . P g, H y_k . P g, s_k . y, H y_k . y (B, slots, 4), g . s (B,), x_new . precision
+        x_new (B,). Then the values of `others`, device arrays that are read in the same wait.
+        """
         sums, *others = self._buffers.device.get_all([self._sums, *others])
         self._sent.clear()
         sums = np.add.reduceat(sums.astype(np.float64), self._first_chunks, axis=0)
@@ -124,9 +127,9 @@ class LbfgsSteps:
 
     def advance(self, a, c, scale, length):
         """Queues the next trials: a, c (B, slots), scale, length (B,)."""
-        b = self._buffers
-        table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
-        self._send(np.ascontiguousarray(table, b.dtype), self._coefficients)
+        table, n = np.empty(self._coefficients.shape, self._buffers.dtype), self._n_slots
+        table[:, :n], table[:, n : 2 * n], table[:, -2], table[:, -1] = a, c, scale, length
+        self._send(table, self._coefficients)
         self._advance(self._size)
 
     def reweigh(self, light, weights):
@@ -147,14 +150,10 @@ class LbfgsSteps:
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []
-        own = [(s, some.direction.values) for s, some in enumerate(blocks) if some.direction]
-        found = [(scene[s], start[s] + np.arange(len(d)), d) for s, d in own]
-        for i, (some, at) in enumerate(zip(exchanges, b.host_first, strict=False)):
-            for d in some:
-                spectra, moving = d.spectra.ravel(), np.flatnonzero(d.spectra)
-                own = start[at + d.source] + d.places, self._sizes[i, 1][0] + moving
-                found.append((i, np.concatenate(own), np.append(d.values, spectra[moving])))
-        self._set_directions(found)
+        directions = [some.direction for some in blocks], list(exchanges)
+        if directions != self._directions_of:  # as objects
+            self._directions_of = directions
+            self._set_directions(self._placed(*directions))
         listed = [(s, block) for s, some in enumerate(blocks) for block in some.blocks]
         self.shelf.retain([block for _, block in listed])
         for level in range(1 + max((block.level for _, block in listed), default=-1)):
@@ -170,6 +169,18 @@ class LbfgsSteps:
                 "more": level > 0,
             }
             self._levels.append(((self._size[0] * len(own),), given))
+
+    def _placed(self, of_sources, exchanges):
+        """The scene, places (k,) and values (k,) of each direction."""
+        b, start = self._buffers, self._latents.start
+        own = [(s, d.values) for s, d in enumerate(of_sources) if d]
+        found = [(b.host_boxes.scene[s], start[s] + np.arange(len(d)), d) for s, d in own]
+        for i, (some, at) in enumerate(zip(exchanges, b.host_first, strict=False)):
+            for d in some:
+                spectra, moving = d.spectra.ravel(), np.flatnonzero(d.spectra)
+                both = start[at + d.source] + d.places, self._sizes[i, 1][0] + moving
+                found.append((i, np.concatenate(both), np.append(d.values, spectra[moving])))
+        return found
 
     def _set_directions(self, directions):
         """Uploads directions (scene, places (k,), values (k,))."""

@@ -23,6 +23,7 @@ import functools
 import numpy as np
 
 from ....device.contraction import COLUMN_PAD, ImageBatch, round_up_columns, row_stride
+from ....device.program import queue_anew
 from ..boxes import Boxes
 from .boxed import BoxedProduct
 from .composition import SpectralComposition
@@ -51,11 +52,11 @@ class FrameRendering:
     def render(self, spectra, image):
         """Queues the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
         self._composition.compose(self._morph, spectra, self._model)
-        self._op.queue_plain("forward", self._model, image)
+        queue_anew(self._op.queue_plain, "forward", self._model, image)
 
     def back_project(self, image):
         """Queues the adjoint of an image (B, Co, My, Mx) for the gradients that follow."""
-        self._op.queue_plain("adjoint", image, self._model)
+        queue_anew(self._op.queue_plain, "adjoint", image, self._model)
 
     def gather_spectra(self, d_spectra):
         """Queues dA of this observation's channels into d_spectra (S, C)."""

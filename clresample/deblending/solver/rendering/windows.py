@@ -38,11 +38,13 @@ class WindowGroups:
     def __init__(self, boxes, which, cell):
         origin, shape = boxes.origin[which], boxes.shape[which]
         at = ((origin + 0.5 * shape) // np.asarray(cell)).astype(int)
-        keys = np.column_stack([boxes.scene[which], at])
-        cells, group = np.unique(keys, axis=0, return_inverse=True)
+        at -= at.min(axis=0)
+        n_y, n_x = at.max(axis=0) + 1
+        keys = (boxes.scene[which] * n_y + at[:, 0]) * n_x + at[:, 1]
+        cells, group = np.unique(keys, return_inverse=True)
         self.which, self.group = which, np.zeros(len(boxes), int)
-        self.group[which] = group = group.ravel()
-        self.scene = cells[:, 0]
+        self.group[which] = group
+        self.scene = cells // (n_y * n_x)
         self.low = np.full((len(cells), 2), np.iinfo(np.int64).max)
         high = np.zeros((len(cells), 2), np.int64)
         np.minimum.at(self.low, group, origin)
