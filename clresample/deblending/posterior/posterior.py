@@ -13,6 +13,7 @@ from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.extended import missed_light
 from ..assessment.psf_width import width_errors
 from ..assessment.status import with_misfit_status
+from ..assessment.unsettled import unsettled_fluxes, with_settled_status
 from ..component_images import local_chi2
 from ..linear.aligned_observation import align_observations
 from ..linear.block_matrix import BlockCholesky
@@ -222,6 +223,8 @@ def with_errors(fit, result, peaks, seen):
     # within their errors, by both together 70 % (bench.ladder, single).
     shapes = missed_light(result)
     shapes[fit.fitted] = np.hypot(shapes[fit.fitted], start.flux_scatter * fit.unit)
+    unsettled = unsettled_fluxes(fit)
+    shapes = np.hypot(shapes, np.where(np.isfinite(unsettled), unsettled, 0))
     errors = with_core_errors(widened(with_common_error(errors, shapes), outside), by_psf)
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
@@ -229,12 +232,12 @@ def with_errors(fit, result, peaks, seen):
     division[fit.fitted] = start.flux_doubt * fit.unit[:, None]
     doubts = np.concatenate([doubts, division], axis=2)
     exchanged = exchanged_light(result, posterior.solution, doubted)
-    errors = with_shared_light(errors, doubts, exchanged)
+    errors = replace(with_shared_light(errors, doubts, exchanged), unsettled=unsettled)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
     changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, widths)
     draws = replace(draws, flux_changes=changes)
-    return noted(result, errors=errors, draws=draws)
+    return with_settled_status(noted(result, errors=errors, draws=draws))
 
 
 def posterior_of(fit, morphs, peaks, seen):
