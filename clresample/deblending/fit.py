@@ -46,6 +46,7 @@ class Fit:
     scene, state: Scene and State at the start, later those of `end`
     strength_estimates: those of a MultiscalePrior, or None; losses, status, messages, seconds: see
         Result
+    kept_fluxes: some (n, C) on the way, see assessment/unsettled.py
     """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
@@ -125,6 +126,7 @@ class Fit:
         self.scene, self.state = first_scene(self)
         self.state = self._going_on or self.state
         self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
+        self.kept_fluxes: list[np.ndarray] = []
         self.last_steps = np.zeros_like(self.shifts)
 
     @property

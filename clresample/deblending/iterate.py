@@ -8,6 +8,7 @@ import time
 import numpy as np
 
 from ..device.multi_device import host_threads, map_threads
+from .assessment.unsettled import fluxes_of, keeps_fluxes
 from .ended import Ended
 from .posterior.joint_step import make_joint_step, solve_joint_step
 from .shifts import extrapolate, shift_steps
@@ -82,6 +83,8 @@ class LbfgsRun:
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
         self.stop_for_refit = takes_over
         if past is None:
+            for f in fits:
+                f.kept_fluxes = []
             self.joint_steps = [None] * len(fits)
             self.asked = np.tile([0, np.inf, 0, 0], (len(fits), 1))
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
@@ -107,8 +110,8 @@ class LbfgsRun:
 
     def run(self):
         """Some iterations, after which fits may have stopped; their losses (1, B)."""
-        engine, live = self.engine, self.live.copy()
-        n_steps = min(self.n_steps + CHECK_ITERATIONS, self.settings.max_iter)
+        engine, live, begun = self.engine, self.live.copy(), self.n_steps
+        n_steps = min(begun + CHECK_ITERATIONS, self.settings.max_iter)
         while self.n_steps < n_steps and self.live.any():
             looked = engine.progress.tested.copy()
             for i in np.flatnonzero(engine.round()):
@@ -122,6 +125,10 @@ class LbfgsRun:
         if stop.any():
             self.settle(stop)
             engine.progress.live &= ~over
+        if keeps_fluxes(begun, self.n_steps, self.settings.max_iter) and self.live.any():
+            states = engine.states(self.live)
+            for i in np.flatnonzero(self.live):
+                self.fits[i].kept_fluxes.append(fluxes_of(self.fits[i], states[i]))
         return engine.progress.loss[None]
 
     def shift(self):

@@ -46,6 +46,7 @@ ERRORS |= {
     "MOMENTBIAS": "moment_bound_bias",
     "RESIDUALMAX": "residuals",
     "OUTER": "outside",
+    "UNSETTLED": "unsettled",
 }
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
@@ -58,9 +59,9 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, OUTSIDEBOX, FLUXBIAS,
-    MOMENTBIAS, RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see
-    draws.py), MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other
-    programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per
+    MOMENTBIAS, RESIDUALMAX, OUTER, UNSETTLED, MORPHOLOGYERR (one after the other), those of the
+    draws (see draws.py), MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For
+    other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per
     observation MODEL and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat
     sky is put at RA = Dec = 0. For NaN and infinity see array_hdus.py.
 
@@ -282,8 +283,7 @@ def _errors(hdus):
         end = shape[0] * shape[1]
         maps.append(flat[:end].reshape(shape).copy())
         flat = flat[end:]
-    kept = ERRORS if "OUTER" in hdus else {n: ERRORS[n] for n in ERRORS if n != "OUTER"}
-    arrays = {key: array_of(hdus[name]) for name, key in kept.items()}
+    arrays = {key: array_of(hdus[name]) for name, key in ERRORS.items() if name in hdus}
     return Errors(**arrays, morphology=tuple(maps))
 
 

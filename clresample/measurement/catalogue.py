@@ -12,7 +12,7 @@ from astropy.table import QTable
 from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
 from ..deblending.assessment.status import misfitted_sources
-from ..deblending.ended import Ended
+from ..deblending.assessment.unsettled import unsettled_sources
 from ..deblending.posterior.residuals import channel_residuals
 from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
@@ -57,7 +57,8 @@ class Flag(IntFlag):
 FLAG_MEANINGS = {
     Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
     "over 3 % of the flux outside, as the model goes on there",
-    Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
+    Flag.NOT_CONVERGED: "the blend's fit did not converge, and this flux changed by over 0.2 of its "
+    "error in the last half of the iterations, or by an unknown part",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE_FRAME: "outside the frame, thus not fitted: nothing is measured",
@@ -297,8 +298,7 @@ def _flags(result, flux, error, positions, footprints):
     """Bit masks (S,) of `Flag`; flux (S, C): of the components, at their bound or above."""
     fitted = fitted_sources(result)
     flags = np.zeros(len(fitted), dtype=np.int32)
-    if result.status not in (Ended.CONVERGED, Ended.MISFIT):
-        flags |= Flag.NOT_CONVERGED
+    flags[unsettled_sources(result)] |= Flag.NOT_CONVERGED
     flags[~fitted] |= Flag.OUTSIDE_FRAME
     flags[((flux <= 0) & np.isfinite(error)).any(axis=1)] |= Flag.ZERO_FLUX
     flags[fitted & ~np.isfinite(error).all(axis=1)] |= Flag.NO_COVERAGE

@@ -44,6 +44,8 @@ class Errors:
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     outside (S, C) [counts]: flux of the models outside the observed area, see `light_outside`; its
         square is included in `flux` and `colour`. 0 by default
+    unsettled (S, C) [counts]: change of the fluxes in further iterations, as `unsettled_fluxes`
+        estimates it; its square is included too. 0 if the fit converged, infinite where unknown
     """
 
     flux: np.ndarray
@@ -55,10 +57,12 @@ class Errors:
     moment_bound_bias: np.ndarray
     residuals: np.ndarray
     outside: np.ndarray | None = None
+    unsettled: np.ndarray | None = None
 
     def __post_init__(self):
-        if self.outside is None:
-            object.__setattr__(self, "outside", np.zeros(np.shape(self.flux_correction)))
+        for name, value in (("outside", 0.0), ("unsettled", np.inf)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(np.shape(self.flux_correction), value))
 
 
 @dataclass(frozen=True, eq=False)

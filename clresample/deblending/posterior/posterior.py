@@ -13,6 +13,7 @@ from ..assessment.edge import light_outside, widened, with_common_error
 from ..assessment.extended import missed_light
 from ..assessment.psf_width import width_errors
 from ..assessment.status import with_misfit_status
+from ..assessment.unsettled import unsettled_fluxes
 from ..component_images import local_chi2
 from ..linear.aligned_observation import align_observations
 from ..linear.block_matrix import BlockCholesky
@@ -220,9 +221,11 @@ def with_errors(fit, result, peaks, seen):
     change[fit.fitted], scatter[fit.fitted], noise[fit.fitted] = estimate
     errors = replace(errors, flux_correction=errors.flux_correction + change)
     apart = np.hypot(width_errors(result), noise)
+    unsettled = unsettled_fluxes(fit)
+    moves = np.where(np.isfinite(unsettled), unsettled, 0)
     # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
     # within their errors, by both together 70 % (bench.ladder, single).
-    shapes = np.hypot(missed_light(result), scatter)
+    shapes = np.hypot(np.hypot(missed_light(result), scatter), moves)
     errors = widened(with_common_error(errors, shapes), outside)
     errors = with_core_errors(errors, np.hypot(core_errors(result), apart))
     doubted = doubted_shapes(posterior)
@@ -231,7 +234,7 @@ def with_errors(fit, result, peaks, seen):
     division[fit.fitted] = start.flux_doubt * fit.unit[:, None]
     doubts = np.concatenate([doubts, division], axis=2)
     exchanged = exchanged_light(result, posterior.solution, doubted)
-    errors = with_shared_light(errors, doubts, exchanged)
+    errors = replace(with_shared_light(errors, doubts, exchanged), unsettled=unsettled)
     own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
     changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
     changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, apart)
