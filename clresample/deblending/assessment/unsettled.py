@@ -54,4 +54,3 @@ def unsettled_sources(result) -> np.ndarray:
         return np.ones(n, bool)
     error = np.sqrt(np.diagonal(result.errors.colour, axis1=1, axis2=2))
     return ~(result.errors.unsettled <= MAX_CHANGE_SIGMA * error).all(axis=1)
-
