@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import inspect
 import math
 import os
 import threading
@@ -45,6 +46,15 @@ __all__ = ["Device", "get_device"]
 
 # [bytes] Memory is zeroed in pieces of this size: NVIDIA and AMD mishandle fills of 2 GiB and more.
 FILL_BYTES = 1 << 30
+
+
+@functools.cache
+def _makes_arrays_unchecked():
+    """True if pyopencl makes arrays as its own results: checks of shapes take ten times as long."""
+    import pyopencl.array
+
+    needed = {"_fast", "_size", "_context", "_queue"}  # not in its documentation
+    return needed <= set(inspect.signature(pyopencl.array.Array).parameters)
 
 
 class Device:
@@ -101,10 +111,12 @@ class Device:
         if n_bytes > self.memory:
             raise allocation_error(self, n_bytes)
         steps = accumulate(shape[:0:-1], lambda step, n: step * max(n, 1), initial=dtype.itemsize)
-        # pyopencl's own way for its results: checks of the shape take ten times as long
-        given = {"_size": n_bytes // dtype.itemsize, "_context": self.context, "_queue": self.queue}
-        given |= {"strides": tuple(steps)[::-1][: len(shape)], "allocator": self._allocate}
-        return self._call(pyopencl.array.Array, None, shape, dtype, _fast=True, **given)
+        given = {"strides": tuple(steps)[::-1][: len(shape)], "allocator": self._allocate}
+        if not _makes_arrays_unchecked():
+            return self._call(pyopencl.array.Array, self.queue, shape, dtype, **given)
+        given |= {"_size": n_bytes // dtype.itemsize, "_context": self.context}
+        given |= {"_queue": self.queue, "_fast": True}
+        return self._call(pyopencl.array.Array, None, shape, dtype, **given)
 
     def zeros(self, shape, dtype):
         """A pyopencl array (shape) of zeros. Raises DeviceError if it does not fit."""

@@ -48,6 +48,7 @@ ERRORS |= {
     "OUTER": "outside",
     "UNSETTLED": "unsettled",
 }
+ADDED = ("OUTER", "UNSETTLED")  # not in earlier files
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -283,7 +284,11 @@ def _errors(hdus):
         end = shape[0] * shape[1]
         maps.append(flat[:end].reshape(shape).copy())
         flat = flat[end:]
-    arrays = {key: array_of(hdus[name]) for name, key in ERRORS.items() if name in hdus}
+    arrays = {
+        key: array_of(hdus[name])
+        for name, key in ERRORS.items()
+        if name in hdus or name not in ADDED
+    }
     return Errors(**arrays, morphology=tuple(maps))
 
 

@@ -55,14 +55,14 @@ class Footprint:
 
     def contains(self, points) -> np.ndarray:
         """Selects points (..., 2) [model px] on an image's pixel, weighted or not: (...)."""
-        return self.look(points)[0]
+        return self.nearest_pixels(points)[0]
 
     def weighted(self, points) -> np.ndarray:
         """True where the pixel at points (..., 2) [model px] has a weight: (C, ...) bool."""
-        held, (n, m) = self.look(points)
+        held, (n, m) = self.nearest_pixels(points)
         return held & (self.observation.weights > 0)[:, n, m]
 
-    def look(self, points):
+    def nearest_pixels(self, points):
         """Tests if points (..., 2) [model px] lie on the image; returns their nearest pixels too.
 
         (...) bool, and (2, ...) int.
@@ -91,7 +91,7 @@ def unobserved(footprints, shape) -> np.ndarray:
     points = np.stack([*np.indices(shape)], axis=-1)
     seen = np.zeros(shape, dtype=bool)
     for footprint in footprints:
-        held, (n, m) = footprint.look(points)
+        held, (n, m) = footprint.nearest_pixels(points)
         seen |= held & (footprint.observation.weights > 0).any(axis=0)[n, m]
     ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
     if seen.all():

@@ -177,6 +177,8 @@ class Grid(GridDisplay, ABC):
             return known
         mapping = self._map_to(grid_in, tolerance)
         if mapping.positions is None:
+            for shared in (mapping.matrix, mapping.offset):
+                shared.flags.writeable = False
             LAST[self] = weakref.ref(grid_in), tolerance, mapping
         return mapping
 

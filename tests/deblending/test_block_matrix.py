@@ -101,6 +101,9 @@ def test_a_matrix_that_is_not_positive_definite_is_refused():
     matrix.block(4, 4)[:] -= 10 * np.trace(matrix.block(4, 4)) * np.eye(matrix.sizes[4])
     with pytest.raises(np.linalg.LinAlgError):
         BlockCholesky(matrix)
+    matrix.block(4, 4)[0, 0] = np.nan  # of which NumPy's factor says nothing
+    with pytest.raises(np.linalg.LinAlgError):
+        BlockCholesky(matrix)
 
 
 def nearly_one(error):

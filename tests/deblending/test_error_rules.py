@@ -299,6 +299,15 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     np.testing.assert_array_equal(errors.outside_box_moments, [far[:, 0] for far in made.beyond])
 
 
+def test_a_component_without_light_leaves_the_shape_of_its_source_known():
+    made, covariance = made_up(np.random.default_rng(0))
+    made.solution.spectra[np.flatnonzero(OWNER == 1)[0]] = 0
+    errors = made.errors(OWNER, np.zeros((2, 2)), np.ones(2), 0.0)
+    weight = 1 / np.sqrt(np.diag(errors.colour[1]))
+    by = slopes(lambda v: shapes(made, v, 1, weight), len(covariance))
+    np.testing.assert_allclose(errors.moments[1], by @ covariance @ by.T, rtol=1e-4)
+
+
 def test_second_moments_of_stars_have_no_error_and_are_not_released():
     """Their places have, and are; a source with one free component has both."""
     for fixed, known in (((0, 2), False), ((0,), True)):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.blend import Blend
-from clresample.deblending.inspection import levels, listing, shifted, spoilt
+from clresample.deblending.inspection import disagreement, levels, listing, shifted, spoilt
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import _level_lines, inspect
@@ -280,6 +280,22 @@ def test_a_second_channel_confirms_the_shift_of_the_first(shift, n_channels, mon
     monkeypatch.setattr(shifted, "shifts_at", noted)
     found, error = shifted._closer(*images)
     assert len(compared) == n_channels and shifted.significant(found, error) == any(shift)
+
+
+def test_light_at_an_edge_shifts_nothing():
+    """Splines there are of light that goes on beyond the edge."""
+    drawn = (*DRAWN, ((3.0, 30.0), (9000, 9000), 0.0))
+    there = tuple(((y + 0.3, x - 0.2), f, s) for (y, x), f, s in drawn)
+    one, other = looked_at(observed(image_of(drawn))), looked_at(observed(image_of(there)))
+    places = np.array([(3.0, 30.0)])
+    planes = (disagreement.ImagePlane.of(image, 0) for image in (one, other))
+    (found,), (error,) = shifts_at(*planes, places)
+    assert np.abs(found - (0.3, -0.2)).max() < 3 * error < 0.1
+
+
+def test_images_without_light_have_no_brightness_and_no_error():
+    light = np.random.default_rng(0).random((2, 9))
+    assert np.isfinite(disagreement._brightness(light, np.zeros(9))).all()
 
 
 def test_coarse_psfs_are_named():

@@ -229,7 +229,7 @@ def test_exchange_directions_are_renewed_and_earlier_pairs_dropped():
     forgotten = []
     one._trial = SimpleNamespace(forget=lambda: forgotten.append(len(taken)))
     one._precondition()
-    assert forgotten == [1]  # the launches of a trial are others then
+    assert forgotten == [0]  # the launches of a trial are others then, and hold the old blocks
     assert taken == [("blocks", [["new 0"], [], [], ["old 3"]])]
     assert one.pairs.count.tolist() == [0, 0, 1, 1]
     due[:] = False

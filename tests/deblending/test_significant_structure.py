@@ -65,7 +65,7 @@ def test_settled_scenes_of_one_source_count_their_parameters():
         ),
     )
     one.vectors = SimpleNamespace(x_new=None)
-    one.steps = SimpleNamespace(reweigh=nothing, change=lambda: (None,))
+    one.steps = SimpleNamespace(reweigh=nothing, queue_products=nothing, products=lambda: (None,))
     one.strengths.light = None
     one._learn(np.ones(4, bool))
     assert asked == [[True, False, False, False]]

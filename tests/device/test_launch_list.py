@@ -94,9 +94,18 @@ def test_nothing_else_is_recorded(device, doubled):
     queue, x, out = doubled
     other = threading.Thread(target=queue)
 
-    def function():
+    def beside():
         other.start()
         other.join()
+
+    launches = LaunchList(device, beside)
+    launches()
+    device.upload(np.zeros(4, np.float32), out)
+    launches()
+    assert not device.get(out).any()
+
+    def function():
+        queue()
         raise KeyboardInterrupt
 
     launches, calls = LaunchList(device, function), []

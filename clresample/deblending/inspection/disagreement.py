@@ -76,7 +76,8 @@ def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, n
     near = places @ other.matrix.T + other.offset
     radius = RADIUS_FWHM * max(other.psf.fwhm_px[0], one.psf.fwhm_px[0] / np.sqrt(area))
     top = np.array(one.data.shape)[:, None, None] - 1
-    good = other.usable & ((at >= 0) & (at <= top)).all(axis=0) & ~there.hidden
+    # splines of light that is cut at the edge lie below it within a pixel
+    good = other.usable & ((at >= 1) & (at <= top - 1)).all(axis=0) & ~there.hidden
     if smear.hidden.any():
         good &= map_coordinates(smear.hidden.astype(np.float32), at, order=1, mode="nearest") < 0.5
     about = _within(shape, near, radius)
@@ -166,7 +167,7 @@ def _brightness(light, value):
     total = np.stack([np.ones_like(value), light.sum(axis=0)])
     background, mean = np.linalg.lstsq(total.T, value, rcond=None)[0]
     rest = value - background - mean * total[1]
-    normal = light @ light.T + max(abs(mean), 1e-300) ** -2 * np.eye(len(light))
+    normal = light @ light.T + max(abs(mean), 1e-100) ** -2 * np.eye(len(light))
     return mean + np.linalg.solve(normal, light @ rest)
 
 

@@ -44,7 +44,8 @@ CACHED = 1 << 15
 PERIOD_PX = 8
 # [px] Period at which the band is determined.
 BAND_PERIOD_PX = 65
-# Number of cached transfer functions, of 0.3 to 1 MB: those of all observations of a field's tile.
+# Number of cached transfer functions, those of all observations of a field's tile: of 0.3 to 1 MB,
+# and for boxes of 400 pixels a further 2 MB of waves.
 MAX_TRANSFERS = 32
 # Number of elements of a component's images, in its box or rendered, from which several host
 # threads share the work: 100 modes of a galaxy of 100 pixels a side take 20 ms. When threads also

@@ -124,6 +124,8 @@ class BlockCholesky:
         """Factorises node v's columns and subtracts their products from the rest."""
         later = self._later[v]
         self._lower[v] = lower = np.linalg.cholesky(rest.pop((v, v)))
+        if np.isnan(lower).any():  # of a matrix with NaN, of which LAPACK says nothing
+            raise np.linalg.LinAlgError("the matrix holds NaN")
         if not later:
             return
         stacked = np.concatenate([rest.pop((u, v)) for u in later])

@@ -136,7 +136,8 @@ class RenderPlanner:
         executor = None
         if len(ops) == 1:  # its tables are there, with the shift
             executor, moves = ops.popitem()[1].executor(), np.zeros((n, 2))
-        renderer = self._renderer(int(layout), [self._plans[i] for i in members], executor)
+        key = int(layout), *members.tolist()
+        renderer = self._renderer(key, [self._plans[i] for i in members], executor)
         which, low = np.searchsorted(members, self._plan[scene]), np.zeros((n, 2), int)
         return renderer, which, low, np.concatenate([low, low + renderer.size], axis=1), moves
 

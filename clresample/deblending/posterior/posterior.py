@@ -177,12 +177,12 @@ class Posterior:
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
                 continue
-            sums = [part * self._sums[i] for i, part in zip(own, light, strict=True)]
-            by_sums = moment_derivatives(sum(one[:, 0] for one in sums))
+            sums = [self._sums[i] for i in own]
+            by_sums = moment_derivatives(sum(a * one[:, 0] for a, one in zip(light, sums)))
             rows = []
             for one, part in zip(sums, light, strict=True):
                 slopes = by_sums @ one
-                rows.append(np.concatenate([slopes[:, 1:], slopes[:, :1] / part * by_band], axis=1))
+                rows.append(np.concatenate([part * slopes[:, 1:], slopes[:, :1] * by_band], axis=1))
             covariance = np.zeros((5, 5))
             for a, i in enumerate(own):
                 for b, j in enumerate(own):

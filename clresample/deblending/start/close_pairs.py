@@ -36,7 +36,7 @@ BYTES_A_PIXEL = 20  # of root, data, light, residual and weight
 def run_from_equal_profiles(fit, scenes):
     """Fits close pairs in scenes (k,) of a ProfileFit again; the best end of each stays.
 
-    Steps that end where they gain NEED cannot compare ends: fits of such a tolerance have no other.
+    Fits with a tolerance of NEED or more are left as they are: their ends differ by as much.
     """
     groups = [g for b in scenes if fit.tol < NEED for g in _groups(_larger_neighbours(fit, b))]
     if not groups:

@@ -119,8 +119,8 @@ class MultiscaleEngine:
             blocks = self.strengths.schedule.blocks
             self.pairs.forget(exchanging & moved)  # they are of another inverse curvature
         if blocks is not None:
+            self._trial.forget()  # it holds the present blocks, which make room for the next
             self.steps.take_blocks(blocks, self._exchanges)
-            self._trial.forget()
 
     def _evaluate(self):
         """Inner products, slopes and losses at the trials."""
