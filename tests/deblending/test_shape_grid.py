@@ -207,6 +207,7 @@ def test_an_unusual_galaxy_gets_the_mean(grid):
     one, other = found.flux[[1 + 4 * 4 + 3, 1 + 6 * 4 + 3]]
     assert abs(change[0]) < 1e-3 * one[0]
     np.testing.assert_allclose(scatter, (other - one) / 2, rtol=1e-3)
+    assert noise[0] < 0.05 * scatter[0]  # that of the same two profiles is in the fit's
 
 
 def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(grid):
