@@ -136,6 +136,14 @@ def test_fluxes_and_errors_hold_the_estimate_beside_the_curvature(fitted):
     assert moved[0, 0] == pytest.approx(change, rel=1e-3) and change > 0.03 * scatter
 
 
+def test_noise_of_larger_profiles_is_one_error_of_a_band(fitted):
+    """Exposures of a band have one spectrum, and so one error of it."""
+    _, result = fitted(galaxy(2.5, 0.8, 12), n=2)
+    colour = result.errors.colour[0]
+    np.testing.assert_allclose(colour, colour[0, 0], rtol=1e-3)
+    np.testing.assert_allclose(*result.sample_fluxes(3, 0)[:, 0].T, rtol=1e-6)
+
+
 def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatter(fitted):
     """At signal to noise 3; one is significant from 5."""
     before = []
