@@ -142,17 +142,23 @@ def test_a_fit_goes_on_while_a_series_of_its_falls_promises_more(
 
 
 @pytest.mark.parametrize(
-    "n_determined, tested, ends",
-    [(0, True, False), (50, True, False), (150, True, True), (150, False, False)],
+    "n_determined, tested, fall, ends",
+    [
+        (0, True, 1, False),
+        (50, True, 1, False),
+        (90, True, 1, True),
+        (90, False, 1, False),
+        (1000, True, 1.2, True),
+        (1000, True, 1.4, False),
+    ],
 )
-def test_a_source_alone_converges_by_what_its_data_determine(n_determined, tested, ends):
-    """A fall of 2 over five iterations after one of 4, loss_tol 0.5: with 150 parameters it is 3.
-    It has looked for significant structure by then."""
+def test_a_source_alone_converges_by_what_its_data_determine(n_determined, tested, fall, ends):
+    """A fall over five iterations after one twice as large, loss_tol 0.5: with 90 parameters it is
+    1.8, and 2 with many. It has looked for significant structure by then."""
     control = begun(10)
     control.n_determined[:], control.tested[:], control.n_rounds[:] = n_determined, tested, 60
-    control._losses[0, 20::-1] = 10 + np.cumsum(
-        [0, *[-4.0] * 5, *[-1.6] * 5, *[-0.8] * 5, *[-0.4] * 5]
-    )
+    steps = np.repeat([-10, -4, -2, -1], 5) * fall / 5
+    control._losses[0, 20::-1] = 10 + np.append(0, np.cumsum(steps))
     control.next_actions(np.array([True]))
     assert control.converged.tolist() == [ends]
 

@@ -136,6 +136,14 @@ def test_fluxes_and_errors_hold_the_estimate_beside_the_curvature(fitted):
     assert moved[0, 0] == pytest.approx(change, rel=1e-3) and change > 0.03 * scatter
 
 
+def test_noise_of_larger_profiles_is_one_error_of_a_band(fitted):
+    """Exposures of a band have one spectrum, and so one error of it."""
+    _, result = fitted(galaxy(2.5, 0.8, 12), n=2)
+    colour = result.errors.colour[0]
+    np.testing.assert_allclose(colour, colour[0, 0], rtol=1e-3)
+    np.testing.assert_allclose(*result.sample_fluxes(3, 0)[:, 0].T, rtol=1e-6)
+
+
 def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatter(fitted):
     """At signal to noise 3; one is significant from 5."""
     before = []
@@ -207,6 +215,7 @@ def test_an_unusual_galaxy_gets_the_mean(grid):
     one, other = found.flux[[1 + 4 * 4 + 3, 1 + 6 * 4 + 3]]
     assert abs(change[0]) < 1e-3 * one[0]
     np.testing.assert_allclose(scatter, (other - one) / 2, rtol=1e-3)
+    assert noise[0] < 0.05 * scatter[0]  # that of the same two profiles is in the fit's
 
 
 def test_without_significant_light_errors_hold_the_distance_to_larger_profiles(grid):

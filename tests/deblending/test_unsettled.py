@@ -14,9 +14,11 @@ from clresample.deblending.assessment.unsettled import (
     MAX_CHANGE_SIGMA,
     fluxes_of,
     keeps_fluxes,
+    largest_changes,
     unsettled_fluxes,
     unsettled_sources,
 )
+from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.errors import Errors
 
 
@@ -44,9 +46,16 @@ def fit_of(kept, status="iteration limit"):
 def test_a_flux_changes_by_what_it_changed_since_it_was_kept():
     fit = fit_of([np.array([[10.5, 8.0], [5.0, 4.0]]), np.array([[9.0, 8.5], [5.5, 7.0]])])
     np.testing.assert_array_equal(fluxes_of(fit, fit.state), [[10, 8], [5, 6]])
-    np.testing.assert_array_equal(unsettled_fluxes(fit), [[0, 0], [1, 5], [0.5, 20]])
+    changes = unsettled_fluxes(fit)
+    np.testing.assert_array_equal(changes[..., 0], [[0, 0], [-0.5, 0], [0, 20]])
+    np.testing.assert_array_equal(changes[..., 1], [[0, 0], [1, -5], [-0.5, -10]])
     assert np.isinf(unsettled_fluxes(fit_of([]))[1:]).all()
-    assert not unsettled_fluxes(fit_of([], "converged")).any()
+    assert not unsettled_fluxes(fit_of([], "converged")).size
+    # of each source those since one time, in the units of the views
+    largest = largest_changes(changes, fit.unit)
+    np.testing.assert_array_equal(largest[..., 0], [[0, 0], [0, 0], [0, 20]])
+    np.testing.assert_array_equal(largest[..., 1], [[0, 0], [1, -5], [0, 0]])
+    assert not largest_changes(unsettled_fluxes(fit_of([])), fit.unit).any()
 
 
 @pytest.mark.parametrize(
@@ -85,6 +94,23 @@ def test_a_fit_whose_fluxes_have_settled_is_not_flagged_at_its_limit(device, mon
         flags = catalogue(result)["flags"] & Flag.NOT_CONVERGED
         assert flags.all() == flags.any() == (result is short)
     assert np.isinf(short.errors.unsettled).all() and (long.errors.unsettled > 0).all()
-    added = long.errors.colour - short.errors.colour
-    light = long.errors.unsettled
-    np.testing.assert_allclose(added, light[:, :, None] * light[:, None], rtol=1e-6, atol=1e-6)
+
+
+def test_changes_of_fluxes_are_in_errors_with_their_signs(device, monkeypatch):
+    """Of channels, and of sources that exchange light; in the draws too."""
+    b, settings = scenes.blend(), Settings(max_iter=14, loss_tol=0)
+    short = scenes.fit(b, device, settings=settings)
+    n, rng = len(b.sources), np.random.default_rng(0)
+    change = 1e4 * rng.normal(size=(n, len(short.channels)))
+    change[1] = -change[0]
+    moves = np.stack([0.1 * np.roll(change, 1, axis=0), change], axis=2)
+    monkeypatch.setattr(posterior, "unsettled_fluxes", lambda fit: moves)
+    found = scenes.fit(b, device, settings=settings)
+    added = found.errors.colour - short.errors.colour
+    np.testing.assert_allclose(added, change[:, :, None] * change[:, None], rtol=1e-3)
+    added = found.errors.flux - short.errors.flux
+    np.testing.assert_allclose(added, change.T[:, :, None] * change.T[:, None], rtol=1e-3)
+    np.testing.assert_allclose(found.errors.unsettled, np.abs(moves).max(axis=2))
+    by = found.draws.flux_changes.by
+    for one in change:
+        assert np.isclose(by, one).all(axis=1).any()

@@ -10,7 +10,7 @@ from ..posterior.residuals import MISFIT_SIGMAS
 
 
 def width_errors(result) -> np.ndarray:
-    """Errors (S, C) [counts] of fluxes by an error of the PSF's width, independent by channel.
+    """Errors (S, C) [counts] of fluxes by an error of the PSF's width, independent by band.
 
         psf_error w sigma^2 <|grad M|^2> / <M^2> flux,    w = min(1, max(0, m / 5 - 1))
 

@@ -36,13 +36,27 @@ def fluxes_of(fit, state) -> np.ndarray:
 
 
 def unsettled_fluxes(fit) -> np.ndarray:
-    """Largest change (S, C) [counts] of each flux since it was kept; infinite if none was."""
-    changes = np.zeros((len(fit.sources), len(fit.unit)))
-    if fit.status == Ended.LIMIT:
-        now = fluxes_of(fit, fit.state)
-        kept = [np.abs(fluxes - now) for fluxes in fit.kept_fluxes]
-        changes[fit.fitted] = np.max(kept, axis=0) * fit.unit if kept else np.inf
+    """Changes (S, C, k) [counts] of fluxes since each time they were kept; infinite if never."""
+    shape = len(fit.sources), len(fit.unit)
+    if fit.status != Ended.LIMIT:
+        return np.zeros((*shape, 0))
+    changes = np.zeros((*shape, max(len(fit.kept_fluxes), 1)))
+    now = fluxes_of(fit, fit.state)
+    kept = [(now - fluxes) * fit.unit for fluxes in fit.kept_fluxes]
+    changes[fit.fitted] = np.stack(kept, axis=2) if kept else np.inf
     return changes
+
+
+def largest_changes(changes, unit) -> np.ndarray:
+    """The largest of the changes (S, C, k) of each source, 0 for its others and unknown ones.
+
+    Changes since one time keep their signs, and with them correlations of channels and sources.
+
+    unit (C,) [counts]: of the norm by which the changes of a source are compared
+    """
+    known = np.where(np.isfinite(changes), changes, 0)
+    norm = np.linalg.norm(known / unit[:, None], axis=1, keepdims=True)
+    return np.where(norm == norm.max(axis=2, keepdims=True, initial=0), known, 0)
 
 
 def unsettled_sources(result) -> np.ndarray:

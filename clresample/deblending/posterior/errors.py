@@ -44,8 +44,9 @@ class Errors:
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     outside (S, C) [counts]: flux of the models outside the observed area, see `light_outside`; its
         square is included in `flux` and `colour`. 0 by default
-    unsettled (S, C) [counts]: change of the fluxes in further iterations, as `unsettled_fluxes`
-        estimates it; its square is included too. 0 if the fit converged, infinite where unknown
+    unsettled (S, C) [counts]: largest change of the fluxes in the last iterations, an estimate of
+        that in further ones, from `unsettled_fluxes`; `flux` and `colour` include the products of
+        signed changes (`largest_changes`). 0 if the fit converged, infinite where unknown
     """
 
     flux: np.ndarray

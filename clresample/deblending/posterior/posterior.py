@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from ..assessment.cores import core_errors, with_core_errors
-from ..assessment.edge import light_outside, widened, with_common_error
+from ..assessment.edge import light_outside, widened
 from ..assessment.extended import missed_light
 from ..assessment.psf_width import width_errors
 from ..assessment.status import with_misfit_status
-from ..assessment.unsettled import unsettled_fluxes
+from ..assessment.unsettled import largest_changes, unsettled_fluxes
 from ..component_images import local_chi2
 from ..linear.aligned_observation import align_observations
 from ..linear.block_matrix import BlockCholesky
@@ -220,25 +220,27 @@ def with_errors(fit, result, peaks, seen):
     estimate = np.moveaxis(start.flux_estimate * fit.unit, 1, 0)
     change[fit.fitted], scatter[fit.fitted], noise[fit.fitted] = estimate
     errors = replace(errors, flux_correction=errors.flux_correction + change)
-    apart = np.hypot(width_errors(result), noise)
     unsettled = unsettled_fluxes(fit)
-    moves = np.where(np.isfinite(unsettled), unsettled, 0)
-    # By the larger of curvature and scatter 64 % of fluxes at signal to noise 10 to 20 would be
-    # within their errors, by both together 70 % (bench.ladder, single).
-    shapes = np.hypot(np.hypot(missed_light(result), scatter), moves)
-    errors = widened(with_common_error(errors, shapes), outside)
-    errors = with_core_errors(errors, np.hypot(core_errors(result), apart))
+    errors = with_core_errors(widened(errors, outside), core_errors(result))
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
-    division = np.zeros((*shapes.shape, start.flux_doubt.shape[2]))
+    division = np.zeros((*noise.shape, start.flux_doubt.shape[2]))
     division[fit.fitted] = start.flux_doubt * fit.unit[:, None]
-    doubts = np.concatenate([doubts, division], axis=2)
+    # Each of these changes one source's fluxes alone. By the larger of curvature and scatter 64 %
+    # of fluxes at signal to noise 10 to 20 would be within their errors, by both together 70 %
+    # (bench.ladder, single).
+    bands = np.eye(len(fit.unit)) if fit.ties is None else fit.ties.matrix
+    by_band = np.where(bands.T[:, None], np.hypot(width_errors(result), noise), 0)
+    parts = np.stack([missed_light(result), scatter, *by_band])
+    source, part = np.nonzero(parts.any(axis=2).T)
+    own = np.zeros((*noise.shape, len(source)))
+    own[source, :, np.arange(len(source))] = parts[part, source]
+    doubts = [doubts, division, largest_changes(unsettled, fit.unit), own]
+    doubts = np.concatenate(doubts, axis=2)
     exchanged = exchanged_light(result, posterior.solution, doubted)
-    errors = replace(with_shared_light(errors, doubts, exchanged), unsettled=unsettled)
-    own = np.flatnonzero(shapes.any(axis=1))  # each an independent change of one source's fluxes
-    changes = np.eye(len(shapes))[:, None, own] * shapes[:, :, None]
-    changes = flux_changes(np.concatenate([doubts, changes], axis=2), exchanged, apart)
-    draws = replace(draws, flux_changes=changes)
+    largest = np.abs(unsettled).max(axis=2, initial=0)
+    errors = replace(with_shared_light(errors, doubts, exchanged), unsettled=largest)
+    draws = replace(draws, flux_changes=flux_changes(doubts, exchanged))
     return noted(result, errors=errors, draws=draws)
 
 

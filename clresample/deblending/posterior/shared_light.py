@@ -220,22 +220,18 @@ def with_shared_light(errors, doubts, exchanged):
     return replace(errors, flux=flux, colour=colour)
 
 
-def flux_changes(doubts, exchanged, apart):
+def flux_changes(doubts, exchanged):
     """The FluxChanges that scatter as `with_shared_light` adds to errors; None without any.
 
-    doubts (S, C, k), exchanged (S, S, C) [counts]: see there; apart (S, C) [counts]: scatter of
-        fluxes, each independent of all others
+    doubts (S, C, k), exchanged (S, S, C) [counts]: see there
     """
     source, doubt = np.nonzero(doubts.any(axis=1))
     giver, taker = np.nonzero(exchanged.any(axis=2))
-    lone, channel = np.nonzero(apart)
-    if not len(source) + len(giver) + len(lone):
+    if not len(source) + len(giver):
         return None
     pairs, light = doubts.shape[2] + np.arange(len(giver)), exchanged[giver, taker]
-    alone = doubts.shape[2] + len(giver) + np.arange(len(lone))
-    by = np.eye(apart.shape[1])[channel] * apart[lone, channel, None]
     return FluxChanges(
-        np.concatenate([source, giver, taker, lone]),
-        np.unique(np.concatenate([doubt, pairs, pairs, alone]), return_inverse=True)[1],
-        np.concatenate([doubts[source, :, doubt], light, -light, by]),
+        np.concatenate([source, giver, taker]),
+        np.unique(np.concatenate([doubt, pairs, pairs]), return_inverse=True)[1],
+        np.concatenate([doubts[source, :, doubt], light, -light]),
     )

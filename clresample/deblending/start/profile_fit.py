@@ -49,7 +49,7 @@ class ProfileFit:
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
-        is common to all channels, and that of each, see shape_grid.py; 0 for others
+        is common to all channels, and that of each band, see shape_grid.py; 0 for others
     flux_doubt (N, C, k): changes of fluxes, each of close pairs, see close_pairs.py
     """
 

@@ -21,8 +21,8 @@ weights w_k of more unusual galaxies, UNUSUAL_IN_FLUXES, catalogues have the mea
     f = f_0 + (sum w_k f_k - f_0) / contamination
     var = sum w_k (f_k - f)^2 + sum w_k (n_k^2 - n_0^2)
 
-for the flux f_0 and the noise n_0 of the fitted profile, and errors have both parts of the
-variance, the second one for each channel alone (posterior.py). In the light of neighbours the
+for the flux f_0 and the noise n_0 of the profile that is set, and errors have both parts of the
+variance, the second one for each band alone (posterior.py). In the light of neighbours the
 weights are the prior's alone, and the flux stays. It also stays where the grid has a better profile
 that the fit of all galaxies refused, since that profile holds a neighbour's light, and where the
 fitted profile has no light, since its contamination is not known then.
@@ -111,23 +111,26 @@ class ShapeGrid:
 
     def posterior(self, fit):
         """Parameters (4,) to be set, and their row (3, C) of `ProfileFit.flux_estimate`."""
-        theta, flux, gain = self.theta[1:], self.flux[1:], self.gain[1:]
+        theta, gain = self.theta[1:], self.gain[1:]
+        flux, variance = self.flux[1:], self.variance[1:]
         at = self.scene, self.index, LEARNED
         scatter, contamination = fit.population.scatter[at], self.contamination(fit)
         away = (theta[:, LEARNED] - fit.population.mean[at]) / scatter
         usual = np.exp(-np.square(away).sum(axis=1) / 2) / (2 * np.pi * scatter.prod())
-        found, about, n_near = self.theta[0], self.flux[0], len(SIZE_STEPS) * len(LN_BETA)
+        n_near, found = len(SIZE_STEPS) * len(LN_BETA), self.theta[0]
+        about, noise_0 = self.flux[0], self.variance[0]
         near = np.exp((gain[:n_near] - gain[:n_near].max()) / (2 * contamination))
         weight, unusual = _weights(near, usual[:n_near], UNUSUAL)
         if unusual > MIN_UNUSUAL and self.gain.max() >= NEED * contamination:
             found, about = weight @ theta[:n_near], weight @ flux[:n_near]
+            noise_0 = weight @ variance[:n_near]
         likelihood = np.exp((gain - gain.max()) / (2 * contamination))
         likelihood[n_near:] *= FAR_WEIGHT
         weight, _ = _weights(likelihood, usual, UNUSUAL_IN_FLUXES)
         stays = self.best(fit) > 0 or self.gain[0] <= 0
-        change = (weight @ flux - about) / (np.inf if stays else contamination)
+        change = 0 * about if stays else (weight @ flux - about) / contamination
         scatter = np.sqrt(weight @ np.square(flux - about - change))
-        noise = np.sqrt(np.maximum(weight @ self.variance[1:] - self.variance[0], 0))
+        noise = np.sqrt(np.maximum(weight @ variance - noise_0, 0))
         return found, np.stack([change, scatter, noise])
 
 
