@@ -58,7 +58,7 @@ FLAG_MEANINGS = {
     Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
     "over 3 % of the flux outside, as the model goes on there",
     Flag.NOT_CONVERGED: "the blend's fit did not converge, and this flux changed by over 0.2 of "
-    "its error in the last half of the iterations, or by an unknown part",
+    "its error in the last half of the iterations, by an unknown part, or at a wrong model",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE_FRAME: "outside the frame, thus not fitted: nothing is measured",

@@ -117,28 +117,32 @@ def test_a_doubted_profile_is_compared_with_the_ring_around_it():
 
 def test_exchanged_light_leaves_the_sum_of_two_fluxes_alone():
     rng = np.random.default_rng(3)
-    exchanged, doubts = np.zeros((3, 3, 2)), rng.normal(size=(3, 2, 4))
+    exchanged, doubts, none = np.zeros((3, 3, 2)), rng.normal(size=(3, 2, 4)), np.zeros((0, 3, 2))
     exchanged[0, 1], exchanged[1, 0] = (3.0, 4.0), (5.0, 0.0)
     flux, colour = np.zeros((2, 3, 3)), np.zeros((3, 2, 2))
     nothing = np.zeros((3, 5, 5)), (), np.zeros((3, 6)), np.zeros((3, 2)), np.zeros((3, 5))
     errors = Errors(flux, colour, *nothing, np.zeros((3, 2)))
-    assert with_shared_light(errors, doubts[..., :0], 0 * exchanged) is errors
-    found = with_shared_light(errors, doubts[..., :0], exchanged)
+    found = with_shared_light(errors, doubts[..., :0], exchanged, none)
     np.testing.assert_allclose(found.flux[0], [[34, -34, 0], [-34, 34, 0], [0, 0, 0]])
     np.testing.assert_allclose(found.colour[0], found.colour[1])
     np.testing.assert_allclose(found.colour[0], [[34, 12], [12, 16]])
-    found = with_shared_light(errors, doubts, exchanged)
+    found = with_shared_light(errors, doubts, exchanged, none)
     np.testing.assert_allclose(found.colour[2], doubts[2] @ doubts[2].T)
     np.testing.assert_allclose(found.flux[1, 0, 2], doubts[0, 1] @ doubts[2, 1])
     of_both = np.diagonal(found.colour, axis1=1, axis2=2), np.diagonal(found.flux, axis1=1, axis2=2)
     np.testing.assert_allclose(of_both[0], of_both[1].T)
-    changes, rng = flux_changes(doubts, exchanged), np.random.default_rng(0)
+    own = rng.normal(size=(2, 3, 2))
+    more, found = found, with_shared_light(errors, doubts, exchanged, own)
+    np.testing.assert_allclose(found.colour[1] - more.colour[1], own[:, 1].T @ own[:, 1])
+    wanted = np.diag(np.square(own[:, :, 0]).sum(axis=0))
+    np.testing.assert_allclose(found.flux[0] - more.flux[0], wanted, atol=1e-12)
+    changes, rng = flux_changes(doubts, exchanged, own), np.random.default_rng(0)
     drawn = np.array([changes.draw(3, rng) for _ in range(4000)])  # (n, S, C)
     scale = np.sqrt(np.diagonal(found.flux, axis1=1, axis2=2))
     products = np.einsum("nsc,ntc->cst", drawn, drawn) / len(drawn)
     correlation = (products - found.flux) / (scale[:, :, None] * scale[:, None])
     np.testing.assert_allclose(correlation, 0, atol=0.06)
-    assert flux_changes(0 * doubts, 0 * exchanged) is None
+    assert flux_changes(0 * doubts, 0 * exchanged, 0 * own) is None
 
 
 def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypatch):
@@ -152,15 +156,14 @@ def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypat
     )
     seen = []
 
-    def spied(errors, doubts, exchanged):
+    def spied(errors, doubts, *others):
         seen.append(doubts)
-        return with_shared_light(errors, doubts, exchanged)
+        return with_shared_light(errors, doubts, *others)
 
     monkeypatch.setattr(posterior, "with_shared_light", spied)
     result = fit(blend(objects, shape=(30, 90), seed=5), device)
     flux = np.linalg.norm([c.flux for c in result.components], axis=1)
-    shared = seen[0][:, :, seen[0].any(axis=1).sum(axis=0) > 1]
-    doubt = np.linalg.norm(shared, axis=(1, 2))
+    doubt = np.linalg.norm(seen[0], axis=(1, 2))
     assert 0.2 * flux[1] < doubt[1] < 1.01 * MAX_DOUBT * flux[1]
     assert doubt[2] < 1e-3 * flux[2]
     assert doubt[4] < 1e-3 * flux[4]

@@ -81,6 +81,9 @@ def test_a_source_is_unsettled_where_a_flux_changes_by_part_of_its_error(status,
     assert unsettled_sources(result) == [unsettled]
     assert (catalogue(result)["flags"][0] == Flag.NOT_CONVERGED) == unsettled
     assert unsettled_sources(one_source(status="iteration limit")) == [True]  # without errors
+    given = {"status": status, "sources": result.sources, "errors": errors}
+    wrong = SimpleNamespace(**given, misfit=SimpleNamespace(is_wrong=True))
+    assert unsettled_sources(wrong) == [status not in ("converged", "misfit")]
 
 
 def test_a_fit_whose_fluxes_have_settled_is_not_flagged_at_its_limit(device, monkeypatch):

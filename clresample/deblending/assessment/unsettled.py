@@ -60,11 +60,14 @@ def largest_changes(changes, unit) -> np.ndarray:
 
 
 def unsettled_sources(result) -> np.ndarray:
-    """Selects sources (S,) whose fluxes may still change by over MAX_CHANGE_SIGMA errors."""
+    """Selects sources (S,) whose fluxes may still change by over MAX_CHANGE_SIGMA errors.
+
+    All of those of a model that does not describe the data, since nothing else says so of it.
+    """
     n = len(result.sources)
     if result.status in (Ended.CONVERGED, Ended.MISFIT):
         return np.zeros(n, bool)
-    if result.status != Ended.LIMIT or result.errors is None:
+    if result.status != Ended.LIMIT or result.errors is None or result.misfit.is_wrong:
         return np.ones(n, bool)
     error = np.sqrt(np.diagonal(result.errors.colour, axis1=1, axis2=2))
     return ~(result.errors.unsettled <= MAX_CHANGE_SIGMA * error).all(axis=1)

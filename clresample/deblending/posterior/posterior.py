@@ -231,16 +231,12 @@ def with_errors(fit, result, peaks, seen):
     # (bench.ladder, single).
     bands = np.eye(len(fit.unit)) if fit.ties is None else fit.ties.matrix
     by_band = np.where(bands.T[:, None], np.hypot(width_errors(result), noise), 0)
-    parts = np.stack([missed_light(result), scatter, *by_band])
-    source, part = np.nonzero(parts.any(axis=2).T)
-    own = np.zeros((*noise.shape, len(source)))
-    own[source, :, np.arange(len(source))] = parts[part, source]
-    doubts = [doubts, division, largest_changes(unsettled, fit.unit), own]
-    doubts = np.concatenate(doubts, axis=2)
-    exchanged = exchanged_light(result, posterior.solution, doubted)
+    own = np.stack([missed_light(result), scatter, *by_band])
+    doubts = np.concatenate([doubts, division, largest_changes(unsettled, fit.unit)], axis=2)
+    changes = doubts, exchanged_light(result, posterior.solution, doubted), own
     largest = np.abs(unsettled).max(axis=2, initial=0)
-    errors = replace(with_shared_light(errors, doubts, exchanged), unsettled=largest)
-    draws = replace(draws, flux_changes=flux_changes(doubts, exchanged))
+    errors = replace(with_shared_light(errors, *changes), unsettled=largest)
+    draws = replace(draws, flux_changes=flux_changes(*changes))
     return noted(result, errors=errors, draws=draws)
 
 

@@ -200,38 +200,39 @@ def _larger_profile(solution, i, growth):
     return solution.shapes[i].draw_box(theta, *place, slopes=False)[0]
 
 
-def with_shared_light(errors, doubts, exchanged):
+def with_shared_light(errors, doubts, exchanged, own):
     """Errors of fluxes with what the division of light between neighbours leaves open.
 
     doubts (S, C, k) [counts]: changes of fluxes of scatter 1, each independent of the others
     exchanged (S, S, C) [counts]: see `exchanged_light`; what one source gains the other loses
+    own (m, S, C) [counts]: independent changes, of scatter 1, of each source's fluxes alone
     """
-    if not doubts.size and not exchanged.any():
-        return errors
     s = np.arange(len(exchanged))
     by_channel = doubts.swapaxes(0, 1)
     flux = errors.flux + by_channel @ by_channel.swapaxes(1, 2)
-    colour = errors.colour + doubts @ doubts.swapaxes(1, 2)
+    colour = errors.colour + doubts @ doubts.swapaxes(1, 2) + np.einsum("msc,msd->scd", own, own)
     both = np.moveaxis(exchanged**2 + exchanged.swapaxes(0, 1) ** 2, -1, 0)
     flux = flux - both
-    flux[:, s, s] += both.sum(axis=2)
+    flux[:, s, s] += both.sum(axis=2) + np.square(own).sum(axis=0).T
     given, taken = (np.moveaxis(e, 0, 1) for e in (exchanged, exchanged.swapaxes(0, 1)))
     colour = colour + sum(np.einsum("tsc,tsd->scd", e, e) for e in (given, taken))
     return replace(errors, flux=flux, colour=colour)
 
 
-def flux_changes(doubts, exchanged):
+def flux_changes(doubts, exchanged, own):
     """The FluxChanges that scatter as `with_shared_light` adds to errors; None without any.
 
-    doubts (S, C, k), exchanged (S, S, C) [counts]: see there
+    doubts (S, C, k), exchanged (S, S, C), own (m, S, C) [counts]: see there
     """
     source, doubt = np.nonzero(doubts.any(axis=1))
     giver, taker = np.nonzero(exchanged.any(axis=2))
-    if not len(source) + len(giver):
+    part, lone = np.nonzero(own.any(axis=2))
+    if not len(source) + len(giver) + len(lone):
         return None
     pairs, light = doubts.shape[2] + np.arange(len(giver)), exchanged[giver, taker]
+    alone = doubts.shape[2] + len(giver) + np.arange(len(lone))
     return FluxChanges(
-        np.concatenate([source, giver, taker]),
-        np.unique(np.concatenate([doubt, pairs, pairs]), return_inverse=True)[1],
-        np.concatenate([doubts[source, :, doubt], light, -light]),
+        np.concatenate([source, giver, taker, lone]),
+        np.unique(np.concatenate([doubt, pairs, pairs, alone]), return_inverse=True)[1],
+        np.concatenate([doubts[source, :, doubt], light, -light, own[part, lone]]),
     )
