@@ -68,7 +68,7 @@ class Settings(FitSettings):
         this, and a joint Newton step would gain less than a fifth of it. From 50 iterations on,
         and 10 after the last rejected step, it may instead fall by all of it later, and by twice
         as much over 10 iterations, since only fine structure is left. The limits of a source alone
-        grow with the number of parameters that its data determine, from 25 on.
+        grow with the number of parameters that its data determine, from 25 on, up to fourfold.
         The limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
         iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
         move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`).
