@@ -44,8 +44,7 @@ CACHED = 1 << 15
 PERIOD_PX = 8
 # [px] Period at which the band is determined.
 BAND_PERIOD_PX = 65
-# Number of cached transfer functions, those of all observations of a field's tile: of 0.3 to 1 MB,
-# and for boxes of 400 pixels a further 2 MB of waves.
+# Number of cached transfer functions, of 0.3 to 1 MB: those of all observations of a field's tile.
 MAX_TRANSFERS = 32
 # Number of elements of a component's images, in its box or rendered, from which several host
 # threads share the work: 100 modes of a galaxy of 100 pixels a side take 20 ms. When threads also
@@ -132,16 +131,17 @@ class AlignedObservation:
         """
         k, m_y, m_x = images.shape
         n_y, n_x = m_y * pixel, m_x * pixel
-        nu_y, nu_x, d, to_y, to_x = self.transfer.at((n_y, n_x), self.reach_px)
-        to_y, to_x = to_y[:, :n_y], to_x[:n_x]
+        nu_y, nu_x, d = self.transfer.at((n_y, n_x), self.reach_px)
         if pixel > 1:  # frequencies that its pixels resolve
             rows, columns = (np.abs(nu) <= 0.5 / pixel for nu in (nu_y, nu_x))
             nu_y, nu_x, d = nu_y[rows], nu_x[columns], d[rows][..., columns]
-            to_y = to_y[rows] @ from_cells(n_y, pixel).astype(np.float32)
-            to_x = from_cells(n_x, pixel).T.astype(np.float32) @ to_x[:, columns]
         if self.coefficients is not None:
             parts = self.coefficients[i]
             d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
+        to_y, to_x = _waves(nu_y, -np.arange(n_y)), _waves(-np.arange(n_x), nu_x)
+        if pixel > 1:
+            to_y = to_y @ from_cells(n_y, pixel).astype(np.float32)
+            to_x = from_cells(n_x, pixel).T.astype(np.float32) @ to_x
         ends = zip(low, high, strict=True)
         rows, columns = (slice(self.cell * a, self.cell * b) for a, b in ends)
         from_y = _waves(self._middles(self.y[rows]) - origin[0], nu_y)
@@ -223,15 +223,12 @@ class BandLimitedTransfer:
     def at(self, shape, reach):
         """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the half-plane's weights.
 
-        And the waves (Hy, Ny), (Nx, W) that transform images from their first pixel on, of the
-        period or smaller: it is long enough that a box does not overlap itself within `reach`.
+        The period is long enough that a box does not overlap itself within `reach`.
         """
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)
         if key not in self._found:
-            nu_y, nu_x, d = self._band(key, self._edge)
-            waves = _waves(nu_y, -np.arange(sides[0])), _waves(-np.arange(sides[1]), nu_x)
-            self._found[key] = nu_y, nu_x, d, *waves
+            self._found[key] = self._band(key, self._edge)
         return self._found[key]
 
     @functools.cached_property

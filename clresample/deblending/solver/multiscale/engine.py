@@ -11,6 +11,8 @@ accurate only to 0.05, a fifth of Settings.loss_tol.
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 
 from ....device.program import LaunchList
@@ -73,7 +75,8 @@ class MultiscaleEngine:
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
         self.steps.take_blocks(self.strengths.schedule.blocks, self._exchanges)
-        self._trial = LaunchList(device, self._queue_trial)
+        own = weakref.ref(self)  # in a cycle its buffers would wait for the garbage collector
+        self._trial = LaunchList(device, lambda: own()._queue_trial())
 
     def subset(self, keep):
         """An engine of the scenes `keep` (n,) alone, which continue unchanged."""
