@@ -1,5 +1,6 @@
 """Fits under the prior that learns: what they end with, when they end, one and many."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -227,6 +228,14 @@ def test_ctrl_c_gives_the_present_state(device, monkeypatch, when):
     result = scenes.fit(blend(BRIGHT), device)
     assert result.status == "interrupted" and np.isfinite(chi2(result))
     assert len(result.losses) <= when
+
+
+def test_an_engine_and_its_buffers_are_freed_without_the_garbage_collector(build):
+    engine = made(build, [posed(build)])
+    engine._evaluate()
+    gone = weakref.ref(engine)
+    del engine
+    assert gone() is None
 
 
 def test_settings_that_cannot_be():
