@@ -12,7 +12,7 @@ from .solver.multiscale.engine import vector_bytes
 from .solver.multiscale.prior import MultiscalePrior
 from .start.profile_fit import CHI2_TOL
 
-AUTO = "auto"  # fit_shifts: by measurement
+AUTO = "auto"  # fit_shifts, fit_sky: by measurement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class FitSettings:
 
     max_iter: int = 500
     fit_shifts: bool | str = "auto"
-    fit_sky: bool = False
+    fit_sky: bool | str = "auto"
     psf_error: float = 0.03
     psf_tolerance: float = 1e-3
 
@@ -32,9 +32,10 @@ class FitSettings:
         check_integer("max_iter", self.max_iter)
         for name in ("psf_error", "psf_tolerance"):
             check_fraction(name, getattr(self, name))
-        check_instance("fit_sky", self.fit_sky, (bool, np.bool_))
-        if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
-            raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
+        for name in ("fit_shifts", "fit_sky"):
+            value = getattr(self, name)
+            if not isinstance(value, (bool, np.bool_)) and value != AUTO:
+                raise ValueError(f'{name} is {value!r}, must be True, False or "{AUTO}"')
 
     @property
     def start_tol(self) -> float:
@@ -78,7 +79,9 @@ class Settings(FitSettings):
         observations (inspection/shifted.py), starting from the measured shift
     fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of source-free pixels
         and its error (inspection/levels.py), so that it does not absorb light of wide sources. If
-        no pixel is free of sources the constant is unconstrained
+        no pixel is free of sources the constant is unconstrained. "auto" = only if source-free
+        pixels of an observation have a level of over 0.1 of a pixel's noise and 4 of its errors;
+        then those of all observations are fitted, within 0.1 of a pixel's noise where unknown
     flux_error_floor: relative systematic flux error, added in quadrature,
         the same for all channels of a source. It covers model errors of bright galaxies, photon
         noise missing from the weights, and PSF errors. It applies to a galaxy that equals its

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,7 +21,7 @@ from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
 from ..files.tables import table_hdu
 from .columns import finalise_catalogue
-from .execution.group_results import last_rounds
+from .execution.group_results import SEPARATOR, last_rounds
 from .execution.search_setup import read_search_setup
 from .hats import write_hats
 from .model_mosaics import file_name, write_mosaics
@@ -31,6 +32,7 @@ FILES = (
     *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "fit_table.ecsv", "models.fits"),
     "provenance.json",
 )
+MAX_NOTED = 8  # kinds of messages of fits that notes name
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
     *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
     *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
@@ -74,7 +76,7 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
-    notes = () if find_spec("pyarrow") else (NO_PARQUET,)
+    notes = [*([] if find_spec("pyarrow") else [NO_PARQUET]), *_noted_messages(job, blends)]
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:
         made = list(_write_catalogues(part, table))
@@ -83,7 +85,25 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
         made += write_mosaics(part, job, parts, last)
         made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
     paths += [folder / path.name for path in made]
-    return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), notes)
+    return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), tuple(notes))
+
+
+def _noted_messages(job, fits) -> list[str]:
+    """A line on each kind of messages of a table of fits, the most frequent first.
+
+    Messages of one kind are equal up to their numbers and to the first colon or bracket.
+    """
+    names = {mosaic.name for mosaic in job.mosaics}
+    kinds: Counter[str] = Counter()
+    for text in fits["messages"].tolist():
+        found = set()
+        for line in re.sub(r"[-+]?\d[\w.+-]*", "#", text).split(SEPARATOR):
+            label, _, rest = line.partition(": ")
+            known = f"{label}: " if label in names else ""
+            found.add(known + re.split("[:(]", rest if known else line)[0].strip())
+        kinds.update(found - {""})
+    most = sorted(kinds.items(), key=lambda pair: (-pair[1], pair[0]))[:MAX_NOTED]
+    return [f"{n} of {len(fits)} fits: {kind}; see fit_table.ecsv" for kind, n in most]
 
 
 def _write_catalogues(folder, table):

@@ -105,7 +105,7 @@ NUMBERS = KeyRule(
     one_or_many_schema(NUMBER),
 )
 SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool), {"type": "boolean"})
-SHIFTS = KeyRule(
+AUTOMATIC = KeyRule(
     'true, false or "auto"',
     lambda value: isinstance(value, bool) or value == "auto",
     any_schema({"type": "boolean"}, {"enum": ["auto"]}),
@@ -140,8 +140,8 @@ TABLES = {
         "loss_tol": POSITIVE,
         "monotone": SWITCH,
         "correlation_px": POSITIVE,
-        "fit_shifts": SHIFTS,
-        "fit_sky": SWITCH,
+        "fit_shifts": AUTOMATIC,
+        "fit_sky": AUTOMATIC,
         "flux_error_floor": FRACTION,
         "psf_error": FRACTION,
     },

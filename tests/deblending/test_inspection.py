@@ -7,7 +7,7 @@ from clresample.deblending.blend import Blend
 from clresample.deblending.inspection import disagreement, levels, listing, shifted, spoilt
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
-from clresample.deblending.inspection.inspect import _level_lines, inspect
+from clresample.deblending.inspection.inspect import LEVEL_PART, _level_lines, inspect
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
@@ -72,8 +72,11 @@ def test_of_a_clean_image_nothing_is_said(seed, kind):
 )
 def test_sky_is_named_with_its_level(sky, words):
     o = observed(image_of(sky=sky * NOISE))
-    (message,) = inspected([o]).messages
-    assert words in message and "g " in message and "fit_sky=True" in message
+    for fit_sky, cure in (("auto", "the fit fits it"), (False, "fit_sky=True")):
+        found = inspected([o], fit_sky=fit_sky)
+        (message,) = found.messages
+        assert words in message and "g " in message and cure in message
+        assert found.settings.fit_sky is bool(fit_sky)
     level = levels.sky_level(looked_at(o))
     assert np.abs(level.level - sky * NOISE).max() < 4 * level.error.max() < 0.4 * NOISE
     assert inspected([o], fit_sky=True).messages == []
@@ -93,14 +96,29 @@ def test_a_rim_below_zero_is_no_light():
     assert "hardly tell its level" in message and "g +- " in message
 
 
+def test_a_wrong_sky_frees_those_of_all_observations():
+    """Unknown ones within a tenth of a pixel's noise, or as their rims are below zero."""
+    good, small = observed(image_of()), observed(image_of(shape=(5, 5)), channels=("i", "z"))
+    found = inspected([good, small])
+    assert found.settings.fit_sky is False and np.isinf(found.levels[1].error).all()
+    found = inspected([observed(image_of(sky=0.3 * NOISE)), small])
+    assert found.settings.fit_sky is True and not found.levels[1].level.any()
+    np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
+    rim, error = np.array([-0.3, -0.05]), np.array([0.02, np.inf])
+    sky = levels.SkyLevel(np.zeros(2), np.full(2, np.inf), np.zeros(2), rim, error)
+    sky = sky.within(0.1)
+    np.testing.assert_allclose([sky.level, sky.error], [[-0.3, 0], [0.02, 0.1]])
+
+
 def test_a_level_under_wings_may_be_wrong():
     """Two errors below zero, where the rim is not above it; a rim that is dark shows no sky."""
     o, found = observed(image_of()), []
     for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
         sky = levels.SkyLevel(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
-        found.append(_level_lines(looked_at(o), sky))
-    ((line,), *others) = found
+        found.append(_level_lines(looked_at(o), sky, True))
+    ((line,), *others), wrong = zip(*found, strict=True)
+    assert not any(wrong)
     assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line
     assert others == [[], []]
 

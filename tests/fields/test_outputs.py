@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from helpers.fields import mosaics_of
 import clresample
 from clresample import FieldOptions
 from clresample.fields.mosaic import FilePlane
+from clresample.fields.outputs import _noted_messages
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
 from clresample.files.atomic import FileError
@@ -38,6 +40,22 @@ def test_every_column_has_its_unit_and_a_description(done):
     blends = QTable.read(folder / "fit_table.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)
     assert blends["seconds"].unit == "s"
+
+
+def test_messages_of_fits_are_counted_by_their_kind():
+    job = SimpleNamespace(mosaics=[SimpleNamespace(name="A")])
+    texts = [
+        "A: sky is left in: g +0.3 sigma | light in B lies at (1, 2)",
+        "",
+        "A: sky is left in: r",
+    ]
+    fits = QTable(
+        {"messages": [*texts, "light in B lies at (3, 4) | light in B lies at (5, -1e3)"]}
+    )
+    assert _noted_messages(job, fits) == [
+        "2 of 4 fits: A: sky is left in; see fit_table.ecsv",
+        "2 of 4 fits: light in B lies at; see fit_table.ecsv",
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -54,7 +54,7 @@ def star_psfs(source=PointSource, **given):
     """Returns `with_star_psfs` of such a star listed as a kind of source, and its place."""
     observation, star = observed(**given)
     image = InspectedImage.of(observation, model_frame([observation]), star[None], np.zeros(2))
-    return *with_star_psfs(image, [source(position_px=tuple(star))], False), star
+    return *with_star_psfs(image, [source(position_px=tuple(star))], False, False), star
 
 
 @pytest.mark.parametrize("half_px", [30, 33])

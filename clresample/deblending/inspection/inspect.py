@@ -55,7 +55,7 @@ class Inspection:
     """Results of the inspection of a blend.
 
     blend: the Blend to be fitted, spoilt pixels masked; the one inspected where there are none
-    settings: FitSettings with fit_shifts decided
+    settings: FitSettings with fit_shifts and fit_sky decided
     shifts (n_observations, 2) [model px]: of the observations, from which a fit of them starts
     messages: a sentence for each problem
     levels: SkyLevel of each observation
@@ -76,21 +76,27 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
+    auto = settings.fit_sky == AUTO
+    always = fit_sky = bool(settings.fit_sky) and not auto
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
-        levels.append(sky_level(image))
-        image = image.over(levels[-1].level)
+        sky = sky_level(image)
+        image = image.over(sky.level)
+        about, wrong = (
+            (_unsure_lines(image, sky), False) if always else _level_lines(image, sky, auto)
+        )
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        image, wide, own = with_star_psfs(image, sources, settings.fit_sky)
+        image, wide, own = with_star_psfs(image, sources, always or (wrong and auto), always)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         if wide.any():
-            levels[-1] = replace(levels[-1], error=np.full_like(levels[-1].error, np.inf))
-        about = _unsure_lines if settings.fit_sky else _level_lines
-        lines = _unmeasured(image) + ([] if wide.any() else about(image, levels[-1]))
+            sky, about, wrong = replace(sky, error=np.full_like(sky.error, np.inf)), [], False
+        levels.append(sky)
+        fit_sky = fit_sky or (wrong and auto)
+        lines = _unmeasured(image) + about
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)
@@ -108,7 +114,10 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
-    settings = replace(settings, fit_shifts=move)
+    if auto and fit_sky:
+        pairs = zip(levels, images, strict=True)
+        levels = [sky.within(LEVEL_PART * image.sigma) for sky, image in pairs]
+    settings = replace(settings, fit_shifts=move, fit_sky=fit_sky)
     return Inspection(blend, settings, shifts, messages + lines, levels)
 
 
@@ -136,8 +145,11 @@ def _unmeasured(image):
     ]
 
 
-def _level_lines(image, sky):
-    """Messages about a SkyLevel other than zero, and about light at the rim."""
+def _level_lines(image, sky, auto):
+    """Messages about a SkyLevel other than zero, and about light at the rim.
+
+    Also returns True if the level is certainly not zero. auto: True if it is fitted then
+    """
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known, doubt = np.isfinite(error), False
     rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
@@ -161,10 +173,15 @@ def _level_lines(image, sky):
         if chosen.any():
             lines.append(
                 f"{what}: pixels without a source have the level {_parts(image, level, chosen)}"
-                f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
+                " a pixel; "
+                + (
+                    "the fit fits it, near this level"
+                    if auto
+                    else f"every flux holds its share of it; {cure}, or give fit_sky=True"
+                )
             )
     if lines or not np.isfinite(rim_error).all():
-        return lines
+        return lines, bool(lines)
     if rim.mean() > RIM_PART + unsure:
         lines.append(
             "the pixels furthest from the sources are not dark, "
@@ -178,7 +195,7 @@ def _level_lines(image, sky):
             f"{_parts(image, sky.level, known)} a pixel, +- {error[known].mean():.2g} sigma, and "
             "every flux holds its share of it; give fit_sky=True or a larger image"
         )
-    return lines
+    return lines, False
 
 
 def _unsure_lines(image, sky):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,17 @@ class SkyLevel:
     wings: np.ndarray
     rim: np.ndarray
     rim_error: np.ndarray
+
+    def within(self, error) -> SkyLevel:
+        """The SkyLevel with unknown levels replaced by those of the rim, if they are below zero.
+
+        Others become 0, with an error (C,) [counts].
+        """
+        below = self.rim < -error
+        ends = np.isinf(self.error)
+        level = np.where(ends & below, self.rim, self.level)
+        own = np.where(below, np.minimum(self.rim_error, error), error)
+        return replace(self, level=level, error=np.where(ends, own, self.error))
 
 
 def sky_level(image) -> SkyLevel:

@@ -104,7 +104,7 @@ class StarPSFs(PSFField):
         return self.psf if self.field is None else self.field.psf_at(y, x)
 
 
-def with_star_psfs(image, sources, sky):
+def with_star_psfs(image, sources, sky, sky_beside_wide):
     """The InspectedImage with own PSFs for masked stars, and two numbers of channels (S,) of each.
 
     Those in which it has a wide core, from MIN_STAR_RADIUS_FWHM, and those of them in which it does
@@ -113,7 +113,8 @@ def with_star_psfs(image, sources, sky):
     The masked pixels of wide cores grow by WIDE_GROW_PX, of others by `spoilt.GROW_PX`; see
     `StarCore.grown`. Without any core the image is returned unchanged.
 
-    sources: those of `image.places`; sky: True if a sky level is fitted
+    sources: those of `image.places`; sky, sky_beside_wide: True if a sky level is fitted,
+        without and with wide cores
     """
     stars = [i for i, source in enumerate(sources) if _may_be_star(source) and image.inside[i]]
     found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
@@ -134,6 +135,7 @@ def with_star_psfs(image, sources, sky):
         given = image.significance[c], image.usable[c], WIDE_GROW_PX if is_wide else GROW_PX
         grown[c] |= image.usable[c] & core.grown(*given)
     image = image.without(grown) if grown.any() else image
+    sky = sky_beside_wide if n_wide.any() else sky
     for i, cores in found.items():
         own = {c: _measure_psf(image, c, i, *core, sky) for c, core in cores.items()}
         found[i] = {c: measured for c, measured in own.items() if measured is not None}
@@ -214,7 +216,8 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     None if the star's light does not fall from the core outwards, or that of a star which keeps the
     PSF's core has no halo beyond the PSF's image. The samples' sum is 1 less the light left out of
     the core.
-    i: number of the model's star; core: StarCore; is_wide, sky: see `with_star_psfs`
+    i: number of the model's star; core: StarCore; is_wide: see `with_star_psfs`; sky: True if a
+        sky level is fitted
     """
     o, fwhm, place = image.observation, float(image.observation.psf.fwhm_px[c]), image.places[i]
     psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]

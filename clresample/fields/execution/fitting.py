@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -13,6 +14,7 @@ from ...deblending.assessment.status import with_source_misfit_status
 from ...deblending.batch import deblend_many
 from ...deblending.blend import Blend, Failure
 from ...deblending.ended import Ended
+from ...deblending.inspection.inspect import InputWarning
 from ...deblending.settings import FitSettings, Settings
 from ...device.device import get_device
 from ...device.discovery import DeviceLostError
@@ -27,7 +29,7 @@ from ...sky.sources import ExtendedSource
 from ..blends.cutouts import make_blend, with_profiles
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
-from .group_results import GroupResults
+from .group_results import SEPARATOR, GroupResults
 
 # Errors that concern one patch only: the others of its group continue.
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
@@ -214,7 +216,9 @@ def _fits(job, blends, rough=None):
     results: list = [None] * len(blends)
     for (limits, *_), alike in sizes.items():  # all at once, those of one size would be padded too
         settings, few = _settings(job, *limits), [blends[i] for i in alike]
-        found = deblend_many(few, settings=settings, device=device, memory=job.memory)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # the results' messages are stored
+            found = deblend_many(few, settings=settings, device=device, memory=job.memory)
         if any(r.status == Ended.INTERRUPTED for r in found):
             raise KeyboardInterrupt
         for failure in (r for r in found if isinstance(r, Failure)):
@@ -353,6 +357,7 @@ def _take(part, job, cut, result, n_round):
             patch.box.area,
             n_iterations,
             seconds,
+            _ascii(SEPARATOR.join(result.messages)),
         )
     )
 
@@ -386,7 +391,7 @@ def _set_aside(part, job, patch, n_round, reason):
     part.rows.append(rows)
     status = f"{Ended.FAILED}: {reason}"
     part.patches.append(
-        (patch.number, patch.parent, n_round, status, len(rows), patch.box.area, 0, 0.0)
+        (patch.number, patch.parent, n_round, status, len(rows), patch.box.area, 0, 0.0, "")
     )
     part.n_failed += 1
 
@@ -408,6 +413,10 @@ def _add_columns(rows, ids, job, patch, status, reason):
 
 
 def _line(error):
-    """An error in one line of ASCII, as FITS tables hold it."""
-    text = str(error) or type(error).__name__
-    return " ".join(text.split()).encode("ascii", "replace").decode()[:190]
+    """An error as FITS tables hold it."""
+    return _ascii(str(error) or type(error).__name__)[:190]
+
+
+def _ascii(text):
+    """A text in one line of ASCII, as FITS tables hold it."""
+    return " ".join(text.split()).encode("ascii", "replace").decode()

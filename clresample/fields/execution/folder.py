@@ -12,7 +12,7 @@ from ...files.atomic import FileError, atomic_file, check_folder, remove_stale, 
 from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
-FORMAT = 6  # of that folder; raised when another version would misread it
+FORMAT = 7  # of that folder; raised when another version would misread it
 
 
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):

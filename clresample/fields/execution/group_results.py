@@ -27,8 +27,10 @@ PATCH_COLUMNS = definitions(
         "n_pixels": ("of the model, about the blend", None, np.int64),
         "n_iterations": ("of the fit", None, np.int64),
         "seconds": ("of the fit, its share of a group's", u.s),
+        "messages": ("problems of the fit, its images and sources, with | between them", None, "U"),
     }
 )
+SEPARATOR = " | "  # between the messages of a fit
 META = "FRAME", "EXTNAME"  # cards of a table's header that enter its Columns too
 FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
 FOUND_COLUMNS = {
