@@ -155,7 +155,7 @@ def row_of(name, spoilt, fit, reference, brightest):
 
 def false_texts(texts, name, scene):
     """The texts about a scene, spoilt by nothing, that are not true of it."""
-    true = [spoilt_scenes.TRUE_OF[name]] if name in spoilt_scenes.TRUE_OF else []
+    true = list(spoilt_scenes.TRUE_OF.get(name, ()))
     true += [DOUBLES] if spoilt_scenes.has_doubles(scene) else []
     return [text for text in texts if not any(words in text for words in true)]
 

@@ -24,8 +24,12 @@ ROMAN_SNR, ROMAN_SIZE_ARCSEC = (300.0, 150.0, 80.0), (0.15, 0.2, 0.1)
 # Words of warnings that are true of scenes as they are. hsc_blend: its catalogue lacks a source,
 # with which chi2 is lower by 318 in five bands; `sep` finds it too. hsc_cutout: where HST's image
 # of the same sky is darkest, a tenth of the pixels, the level is -0.31 to -0.36 +- 0.05 sigma in
-# each band, since the background of crowded images is too high.
-TRUE_OF = {"hsc_blend": "no source is listed for", "hsc_cutout": "too much sky was subtracted"}
+# each band, since the background of crowded images is too high. HSC's coadds are resampled.
+CORRELATED = "noise of neighbouring pixels is correlated"
+TRUE_OF = {
+    "hsc_blend": ("no source is listed for", CORRELATED),
+    "hsc_cutout": ("too much sky was subtracted", CORRELATED),
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,11 @@ def inspected(observations, sources=None, **settings):
     return inspect(blend, frame, positions, shifts, Settings(**settings))
 
 
+def sky_of(*numbers):
+    blocks = levels.BlockGrid.of(SHAPE)
+    return levels.SkyLevel(*numbers, blocks, np.zeros((2, len(blocks.centers())), bool), np.ones(2))
+
+
 def looked_at(observation, sources=None):
     frame = model_frame([observation])
     return InspectedImage.of(
@@ -105,7 +110,7 @@ def test_a_wrong_sky_frees_those_of_all_observations():
     assert found.settings.fit_sky is True and not found.levels[1].level.any()
     np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
     rim, error = np.array([-0.3, -0.05]), np.array([0.02, np.inf])
-    sky = levels.SkyLevel(np.zeros(2), np.full(2, np.inf), np.zeros(2), rim, error)
+    sky = sky_of(np.zeros(2), np.full(2, np.inf), np.zeros(2), rim, error)
     sky = sky.within(0.1)
     np.testing.assert_allclose([sky.level, sky.error], [[-0.3, 0], [0.02, 0.1]])
 
@@ -115,7 +120,7 @@ def test_a_level_under_wings_may_be_wrong():
     o, found = observed(image_of()), []
     for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
-        sky = levels.SkyLevel(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
+        sky = sky_of(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
         found.append(_level_lines(looked_at(o), sky, True))
     ((line,), *others), wrong = zip(*found, strict=True)
     assert not any(wrong)
@@ -133,6 +138,27 @@ def test_wings_are_no_sky():
     assert (np.abs(level.level) < 3 * level.error).all() and (level.rim > 0.4 * NOISE).all()
     (message,) = inspected([o], source).messages
     assert "the pixels furthest from the sources are not dark" in message
+
+
+@pytest.mark.parametrize("width, declared", [(0.0, None), (0.6, None), (0.6, "estimate")])
+def test_correlated_noise_is_named_unless_it_is_declared(width, declared):
+    from scipy.ndimage import gaussian_filter
+
+    noise = gaussian_filter(np.random.default_rng(3).normal(size=(2, *SHAPE)), (0, width, width))
+    data = image_of(noise=0) + NOISE * noise / noise.std()
+    found = inspected([observed(data, noise=declared)]).messages
+    assert len(found) == (width > 0 and declared is None)
+    for message in found:
+        assert 'noise="estimate"' in message and "(g)" in message and "(r)" in message
+        ratio = float(message.partition("scatter ")[2].split()[0])
+        assert ratio == pytest.approx(1 / noise.std(), rel=0.3)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_wrong_weights_are_named(factor):
+    (message,) = inspected([observed(image_of(), weights=(factor * NOISE) ** -2)]).messages
+    stated = float(message.partition("scatter by ")[2].split()[0])
+    assert stated == pytest.approx(1 / factor, rel=0.1) and "scale weights" in message
 
 
 def test_levels_allow_for_correlated_noise():

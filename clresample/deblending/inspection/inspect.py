@@ -14,6 +14,7 @@ from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
+from .pixel_noise import noise_lines
 from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths
 
@@ -96,7 +97,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
             sky, about, wrong = replace(sky, error=np.full_like(sky.error, np.inf)), [], False
         levels.append(sky)
         fit_sky = fit_sky or (wrong and auto)
-        lines = _unmeasured(image) + about
+        lines = _unmeasured(image) + about + ([] if wide.any() else noise_lines(image, sky))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)

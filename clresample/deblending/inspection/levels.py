@@ -28,6 +28,50 @@ DARK, RIM = 0.5, 0.25
 POWERS = 2.0, 3.0, 4.0
 
 
+@dataclass(frozen=True)
+class BlockGrid:
+    """B square blocks of pixels of an image, in rows.
+
+    corner (2,) [px]: first pixel of the first one; counts (2,): numbers along y, x; side [px]
+    """
+
+    corner: tuple[int, int]
+    counts: tuple[int, int]
+    side: int
+
+    @classmethod
+    def of(cls, shape) -> BlockGrid:
+        """That of images of a shape (2,), none of images smaller than a block."""
+        side = max(MIN_BLOCK_PX, -(-max(shape) // N_BLOCKS))
+        n_y, n_x = (n // side if min(shape) >= side else 0 for n in shape)
+        y, x = (n % side // 2 for n in shape)
+        return cls((y, x), (n_y, n_x), side)
+
+    def centers(self) -> np.ndarray:
+        """Their centres (B, 2) [px]."""
+        pairs = zip(self.corner, self.counts, strict=True)
+        axes = [first + self.side * np.arange(n) + (self.side - 1) / 2 for first, n in pairs]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    def sums(self, values) -> np.ndarray:
+        """Sums (C, B) over them of values (C, My, Mx)."""
+        (n_y, n_x), side = self.counts, self.side
+        cut = values[self._inner].reshape(len(values), n_y, side, n_x, side)
+        return np.einsum("cyixj->cyx", cut).reshape(len(values), -1)
+
+    def on_pixels(self, values, shape) -> np.ndarray:
+        """Their values (C, B) on the pixels (C, My, Mx) of an image, 0 beyond them."""
+        out = np.zeros(shape, values.dtype)
+        rows = values.reshape(len(values), *self.counts).repeat(self.side, axis=1)
+        out[self._inner] = rows.repeat(self.side, axis=2)
+        return out
+
+    @property
+    def _inner(self):
+        pairs = zip(self.corner, self.counts, strict=True)
+        return (slice(None), *(slice(a, a + n * self.side) for a, n in pairs))
+
+
 @dataclass(frozen=True, eq=False)
 class SkyLevel:
     """Level of the sky in each channel of an observation.
@@ -38,6 +82,9 @@ class SkyLevel:
         sign in all channels
     rim (C,) [counts]: level of the pixels furthest from the sources, wings included
     rim_error (C,) [counts]: error of the rim; infinite if it is unknown
+    blocks: BlockGrid; dark (C, B): bool, those by which the level is measured
+    block_scatter (C,): scatter of their means about the model, over that of white noise, at
+        least 1
     """
 
     level: np.ndarray
@@ -45,6 +92,9 @@ class SkyLevel:
     wings: np.ndarray
     rim: np.ndarray
     rim_error: np.ndarray
+    blocks: BlockGrid
+    dark: np.ndarray
+    block_scatter: np.ndarray
 
     def within(self, error) -> SkyLevel:
         """The SkyLevel with unknown levels replaced by those of the rim, if they are below zero.
@@ -68,15 +118,18 @@ def sky_level(image) -> SkyLevel:
     change of the level between p = 2 and 4 is part of its error; the rest follows from the scatter
     of the blocks, which includes correlated noise.
     """
-    means, counts, centers, side = _blocks(image)
-    n_channels = len(means)
+    data, usable = image.observation.data, image.usable
+    n_channels, blocks = len(data), BlockGrid.of(data.shape[1:])
+    counts, centers = blocks.sums(usable.astype(np.float64)), blocks.centers()
+    means = blocks.sums(np.where(usable, data, 0.0)) / np.maximum(counts, 1)
     white = image.sigma[:, None] / np.sqrt(np.maximum(counts, 1))
     wings = _wings(image, means, centers)
     darker = _darker(image, centers, wings[0])
-    known = 2 * counts > side**2
+    known = 2 * counts > blocks.side**2
     dark = known & (darker < DARK)
     if not (dark.sum(axis=1) >= MIN_BLOCKS).any():
-        return SkyLevel(np.zeros(n_channels), *_unknown(n_channels))
+        zeros, endless = np.zeros(n_channels), np.full(n_channels, np.inf)
+        return SkyLevel(zeros, endless, zeros, zeros, endless, blocks, dark, zeros + 1)
     kept, none = dark, np.zeros(n_channels)
     for _ in range(N_ROUNDS):
         level, wing, variance = _fitted(means, wings[1], white, kept)
@@ -96,13 +149,10 @@ def sky_level(image) -> SkyLevel:
         np.where(enough, unsure, 0.0),
         rim,
         rim_error,
+        blocks,
+        kept,
+        scale,
     )
-
-
-def _unknown(n_channels):
-    """Error, wings, rim and its error of channels without blank pixels."""
-    zeros = np.zeros(n_channels)
-    return zeros + np.inf, zeros, zeros, zeros + np.inf
 
 
 def _rim(means, white, kept):
@@ -119,30 +169,6 @@ def _rim(means, white, kept):
     number = np.maximum(number, 1)
     error = np.sqrt((spread**2 * kept).sum(axis=1)) / number
     return (means * kept).sum(axis=1) / number, np.where(known, error, np.inf)
-
-
-def _blocks(image):
-    """Means (C, B) [counts] and numbers (C, B) of usable pixels in blocks.
-
-    Also returns the blocks' centres (B, 2) [px] and their side [px].
-    """
-    data = image.observation.data
-    n_y, n_x = data.shape[1:]
-    side = max(MIN_BLOCK_PX, -(-max(n_y, n_x) // N_BLOCKS))
-    if min(n_y, n_x) < side:
-        return np.zeros((len(data), 0)), np.zeros((len(data), 0)), np.zeros((0, 2)), side
-    starts = [np.arange(0, n - side + 1, side) + n % side // 2 for n in (n_y, n_x)]
-    inner = tuple(slice(s[0], s[-1] + side) for s in starts)
-
-    def sums(values):
-        cut = values[(slice(None), *inner)]
-        shape = len(cut), len(starts[0]), side, len(starts[1]), side
-        return np.einsum("cyixj->cyx", cut.reshape(shape)).reshape(len(cut), -1)
-
-    counts = sums(image.usable.astype(np.float64))
-    total = sums(np.where(image.usable, data, 0.0))
-    centers = np.stack(np.meshgrid(*(s + (side - 1) / 2 for s in starts), indexing="ij"), axis=-1)
-    return total / np.maximum(counts, 1), counts, centers.reshape(-1, 2), side
 
 
 def _darker(image, centers, wings):
