@@ -13,6 +13,7 @@ from .solver.multiscale.prior import MultiscalePrior
 from .start.profile_fit import CHI2_TOL
 
 AUTO = "auto"  # fit_shifts, fit_sky: by measurement
+SMALL = "small"  # fit_sky: a sky that was nearly subtracted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +33,11 @@ class FitSettings:
         check_integer("max_iter", self.max_iter)
         for name in ("psf_error", "psf_tolerance"):
             check_fraction(name, getattr(self, name))
-        for name in ("fit_shifts", "fit_sky"):
+        for name, words in (("fit_shifts", (AUTO,)), ("fit_sky", (AUTO, SMALL))):
             value = getattr(self, name)
-            if not isinstance(value, (bool, np.bool_)) and value != AUTO:
-                raise ValueError(f'{name} is {value!r}, must be True, False or "{AUTO}"')
+            if not isinstance(value, (bool, np.bool_)) and value not in words:
+                known = ", ".join(("True", "False", *map(repr, words)))
+                raise ValueError(f"{name} is {value!r}, must be one of {known}")
 
     @property
     def start_tol(self) -> float:
@@ -81,7 +83,8 @@ class Settings(FitSettings):
         and its error (inspection/levels.py), so that it does not absorb light of wide sources. If
         no pixel is free of sources the constant is unconstrained. "auto" = only if source-free
         pixels of an observation have a level of over 0.1 of a pixel's noise and 4 of its errors;
-        then those of all observations are fitted, within 0.1 of a pixel's noise where unknown
+        then those of all observations are fitted, within 0.1 of a pixel's noise where unknown.
+        "small" = always, within that where unknown: for skies that are nearly subtracted
     flux_error_floor: relative systematic flux error, added in quadrature,
         the same for all channels of a source. It covers model errors of bright galaxies, photon
         noise missing from the weights, and PSF errors. It applies to a galaxy that equals its

@@ -62,13 +62,15 @@ def check_outputs(folder, mosaics):
         check_output(folder / name, overwrite=True)
 
 
-def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> FieldOutputs:
+def write_outputs(
+    folder, job, parts, unsettled, about, seconds, hats=False, notes=()
+) -> FieldOutputs:
     """Writes all outputs of a field together or none; the folder of HATS before them.
 
     folder: to write into; job: FieldJob; parts: GroupResultsFiles, those of later rounds last
     unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
-    hats: write the catalogue in the HATS layout too, if it has rows
+    hats: write the catalogue in the HATS layout too, if it has rows; notes: of the run so far
 
     catalogue.{parquet,fits,ecsv} are identical for repeated runs of the same field: times are in
     fit_table.ecsv and provenance.json. Raises FileError.
@@ -76,7 +78,7 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
-    notes = [*([] if find_spec("pyarrow") else [NO_PARQUET]), *_noted_messages(job, blends)]
+    notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET]), *_noted_messages(job, blends)]
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:
         made = list(_write_catalogues(part, table))

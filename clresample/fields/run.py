@@ -12,6 +12,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from ..deblending.ended import Ended
+from ..deblending.settings import AUTO, SMALL
 from ..sky.box import Box
 from ..sky.wcs import celestial_frame
 from .blends.tiles import field_part
@@ -21,6 +22,7 @@ from .execution.folder import open_folder
 from .execution.rounds import fit_all_groups
 from .execution.search_setup import prepare_search, read_search_setup
 from .execution.searching import load_or_make_plan
+from .field_toml.estimates import without_sky
 from .hats import check_hats
 from .options import MIN_MEMORY, FieldOptions, RunProgress
 from .outputs import FieldOutputs, check_outputs, write_outputs
@@ -73,6 +75,11 @@ def run_field(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
     )
     whole, clock = Box.of(reference.shape), _Clock(seconds)
+    settings, notes = options.settings, list[str]()
+    if settings.fit_sky == AUTO:
+        mosaics = tuple(without_sky(m, notes) for m in mosaics)
+        settings = replace(settings, fit_sky=SMALL if notes else AUTO)
+        clock.stop("sky")
     core = whole if options.part is None else field_part(whole, *options.part)
     region = core if options.part is None else core.grown(options.margin_px).intersection(whole)
     engine = make_backend(options, progress)
@@ -90,7 +97,7 @@ def run_field(
             plan=plan,
             origin_px=(region.y0, region.x0),
             core=core,
-            settings=options.settings,
+            settings=settings,
             threshold=options.threshold,
             passes=options.passes,
             memory=options.group_memory,
@@ -100,7 +107,9 @@ def run_field(
         engine.close()  # frees its memory for the outputs
         clock.stop("fit")
         progress.stage("write", 1)
-        outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
+        outputs = write_outputs(
+            folder, job, parts, unsettled, about or {}, seconds, options.hats, notes
+        )
     finally:
         engine.close()
         STRIPS.clear()

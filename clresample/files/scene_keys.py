@@ -105,11 +105,18 @@ NUMBERS = KeyRule(
     one_or_many_schema(NUMBER),
 )
 SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool), {"type": "boolean"})
-AUTOMATIC = KeyRule(
-    'true, false or "auto"',
-    lambda value: isinstance(value, bool) or value == "auto",
-    any_schema({"type": "boolean"}, {"enum": ["auto"]}),
-)
+
+
+def _switch_or(*words):
+    """The rule of a switch that may be one of some words too."""
+    known = ["true", "false", *(f'"{word}"' for word in words)]
+    return KeyRule(
+        f"{', '.join(known[:-1])} or {known[-1]}",
+        lambda value: isinstance(value, bool) or value in words,
+        any_schema({"type": "boolean"}, {"enum": list(words)}),
+    )
+
+
 POSITIVE = KeyRule("a number above 0", _above, ABOVE_ZERO)
 
 # Tables that scene files and field files share; that of an image: fields/field_toml/keys.py.
@@ -140,8 +147,8 @@ TABLES = {
         "loss_tol": POSITIVE,
         "monotone": SWITCH,
         "correlation_px": POSITIVE,
-        "fit_shifts": AUTOMATIC,
-        "fit_sky": AUTOMATIC,
+        "fit_shifts": _switch_or("auto"),
+        "fit_sky": _switch_or("auto", "small"),
         "flux_error_floor": FRACTION,
         "psf_error": FRACTION,
     },

@@ -170,7 +170,7 @@ def test_real_scene_files_hold_nothing_but_defaults(data, tmp_path):
     joint = read_scene(paths["hst_hsc"])
     assert [o.name for o in joint.observations] == ["HST", "HSC"]
     assert joint.settings.fit_shifts is True
-    assert str(replace(joint.settings, fit_shifts="auto", fit_sky=False)) == str(Settings())
+    assert str(replace(joint.settings, fit_shifts="auto", fit_sky="auto")) == str(Settings())
     assert joint.sources is None
     assert read_scene(paths["hst"]).settings.fit_shifts == "auto"
 

@@ -29,7 +29,7 @@ def test_defaults_are_those_of_the_docstring():
     """Steps, errors and tolerances as they are documented, and measured."""
     s = Settings()
     assert (s.max_iter, s.loss_tol, s.flux_error_floor) == (500, 0.25, 0.0005)
-    assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, "auto", False)
+    assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, "auto", "auto")
     assert s.errors and s.prior == MultiscalePrior()
     paper = PaperSettings()
     assert (paper.max_iter, paper.rel_tol) == (500, 1e-5)
@@ -54,7 +54,7 @@ BOTH = (Settings, PaperSettings)
         (BOTH, "psf_error", [-1e-9, 1.0], [0, 0.99]),
         (BOTH, "psf_tolerance", [-1e-9, 1.0], [0, 0.99]),
         (BOTH, "fit_shifts", [1, "no", None], [True, np.False_, "auto"]),
-        (BOTH, "fit_sky", [1, "no", None], [True, np.False_]),
+        (BOTH, "fit_sky", [1, "no", None], [True, np.False_, "auto", "small"]),
         ((Settings,), "errors", [1, "no", None], [True, np.False_]),
         ((Settings,), "prior", [3, "none", None, SingleScalePrior()], [MultiscalePrior()]),
         ((PaperSettings,), "prior", [3, MultiscalePrior()], [None, SingleScalePrior()]),

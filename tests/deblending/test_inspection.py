@@ -109,6 +109,9 @@ def test_a_wrong_sky_frees_those_of_all_observations():
     found = inspected([observed(image_of(sky=0.3 * NOISE)), small])
     assert found.settings.fit_sky is True and not found.levels[1].level.any()
     np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
+    found = inspected([good, small], fit_sky="small")
+    assert found.settings.fit_sky is True and not found.messages
+    np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
     rim, error = np.array([-0.3, -0.05]), np.array([0.02, np.inf])
     sky = sky_of(np.zeros(2), np.full(2, np.inf), np.zeros(2), rim, error)
     sky = sky.within(0.1)

@@ -9,10 +9,12 @@ from astropy.io import fits
 
 from clresample import PSF, Grid
 from clresample.cli import main
-from clresample.fields.background import find_background
+from clresample.fields.background import find_background, find_sky
+from clresample.fields.field_toml.estimates import without_sky
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.field_toml.headers import mask_value, zero_point
 from clresample.fields.field_toml.keys import parse_field
+from clresample.fields.mosaic import Mosaic
 from clresample.files.scene_keys import SceneError
 from clresample.sky.box import Box
 
@@ -84,6 +86,40 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
     sky = find_background(lambda box: image[box.slices], everywhere, image.shape)
     level = sky.read(Box(200, 200, 300, 300))
     assert abs(level - 7).max() < 0.3
+
+
+@pytest.mark.parametrize("level", [0.3, -0.2, 0.03])
+def test_a_sky_that_was_left_in_is_measured(level):
+    """That of the darkest cells; not of an image of so few that a galaxy may fill it."""
+    rng, notes = np.random.default_rng(2), []
+    image = rng.normal(2 * level, 2, (640, 640)).astype(np.float32)
+    y, x = np.indices(image.shape)
+    image += 500 * np.exp(-np.hypot(y - 100, x - 260) / 30)
+    sky, part = find_sky(*_readers(image), image.shape)
+    assert (sky is None) == (level == 0.03)
+    assert find_sky(*_readers(image[:320]), (320, 640)) == (None, 0.0)
+    mosaic = Mosaic.of_arrays(
+        "A",
+        image[None],
+        Grid.flat(image.shape, 0.1),
+        PSF.gaussian(2.0),
+        channels=["r"],
+        weights=0.25,
+    )
+    (channel,) = without_sky(mosaic, notes).channels
+    if sky is None:
+        assert channel is mosaic.channels[0] and not notes
+        return
+    assert part == pytest.approx(level, abs=0.05)
+    box = Box(5, 7, 9, 12)
+    np.testing.assert_allclose(sky.read(box), 2 * part, rtol=0.02)
+    np.testing.assert_array_equal(channel.read(box), image[box.slices] - sky.read(box))
+    (note,) = notes
+    assert f"r {part:+.2f}" in note and "fit_sky=False" in note
+
+
+def _readers(image):
+    return lambda box: image[box.slices], lambda box: np.ones(box.shape, bool)
 
 
 def test_options_of_the_file(files):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from ..blend import Blend
-from ..settings import AUTO, FitSettings
+from ..settings import AUTO, SMALL, FitSettings
 from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import InspectedImage
@@ -77,26 +77,26 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
-    auto = settings.fit_sky == AUTO
-    always = fit_sky = bool(settings.fit_sky) and not auto
+    auto, small = settings.fit_sky == AUTO, settings.fit_sky == SMALL
+    fit_sky = free = bool(settings.fit_sky) and not (auto or small)
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
         sky = sky_level(image)
         image = image.over(sky.level)
         about, wrong = (
-            (_unsure_lines(image, sky), False) if always else _level_lines(image, sky, auto)
+            (_unsure_lines(image, sky), False) if free else _level_lines(image, sky, auto or small)
         )
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        image, wide, own = with_star_psfs(image, sources, always or (wrong and auto), always)
+        image, wide, own = with_star_psfs(image, sources, free or small or (wrong and auto), free)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         if wide.any():
             sky, about, wrong = replace(sky, error=np.full_like(sky.error, np.inf)), [], False
         levels.append(sky)
-        fit_sky = fit_sky or (wrong and auto)
+        fit_sky = fit_sky or small or (wrong and auto)
         lines = _unmeasured(image) + about + ([] if wide.any() else noise_lines(image, sky))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
@@ -115,7 +115,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
-    if auto and fit_sky:
+    if fit_sky and not free:
         pairs = zip(levels, images, strict=True)
         levels = [sky.within(LEVEL_PART * image.sigma) for sky, image in pairs]
     settings = replace(settings, fit_shifts=move, fit_sky=fit_sky)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from ...sky.box import Box
 from ...sky.correlation import NoiseCorrelation
 from ...sky.noise import noise_sigma
-from ..background import find_background
+from ..background import find_background, find_sky
 from ..mosaic import ConstantPlane
 
 # [px] Side of the region in a mosaic's middle from which its noise is estimated. A million pixels
@@ -29,6 +29,24 @@ def subtract_background(mosaic, table):
         replace(c, background=find_background(c.data.read, _good(c), mosaic.grid.shape))
         for c in mosaic.channels
     ]
+    return replace(mosaic, channels=tuple(channels))
+
+
+def without_sky(mosaic, notes):
+    """The mosaic with the levels of its sky to subtract, where they are not zero."""
+    channels, found = [], []
+    for c in mosaic.channels:
+        if c.background is None:
+            sky, part = find_sky(c.data.read, _good(c), mosaic.grid.shape)
+            if sky is not None:
+                found.append(f"{c.name} {part:+.2f}")
+                c = replace(c, background=sky)
+        channels.append(c)
+    if found:
+        notes.append(
+            f"{mosaic.name}: the darkest cells of the sky are at {', '.join(found)} of a pixel's "
+            "noise, which is subtracted; with fit_sky=False it is not"
+        )
     return replace(mosaic, channels=tuple(channels))
 
 
