@@ -135,6 +135,14 @@ def intersect_boxes(origin_a, shape_a, origin_b, shape_b):
     return both.relative_to(a).slices, both.relative_to(b).slices
 
 
+def boxes_meet(low, high, other_low, other_high):
+    """Selects pairs of boxes (..., 2) [px] that share a pixel; arguments are broadcast.
+
+    low, high: first pixels (y, x), and the ones past the last
+    """
+    return ((low < other_high) & (other_low < high)).all(axis=-1)
+
+
 def box_slices(origin, shape):
     """The slices (y, x) of a box of `shape` (2,) [px] that starts at `origin` (2,) [px]."""
     return Box.at(origin, shape).slices

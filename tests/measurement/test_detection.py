@@ -132,13 +132,15 @@ def test_what_a_fit_leaves_over_is_found(device):
 
 @pytest.mark.parametrize("shape", [(50, 52), (17, 40), (9, 3), (64, 81)])
 @pytest.mark.parametrize("psf", [(17, 17), (8, 5)])
-def test_the_convolution_is_scipys_to_the_last_bit(shape, psf):
+def test_the_convolution_is_scipys_up_to_rounding(shape, psf):
     from scipy.signal import fftconvolve
 
     rng = np.random.default_rng(4)
     image, kernel = rng.normal(size=shape), rng.random(psf)
     expected = fftconvolve(image, kernel, mode="same")
-    np.testing.assert_array_equal(convolved(image, kernel), expected)
+    np.testing.assert_allclose(
+        convolved(image, kernel), expected, rtol=0, atol=1e-13 * kernel.sum()
+    )
 
 
 @pytest.mark.parametrize("threshold", [0, -1, float("nan"), float("inf")])

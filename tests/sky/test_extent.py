@@ -5,7 +5,7 @@ import pytest
 from helpers.headers import DEC, OBSERVED, RA, SCALE, SIP, grid_of, header, observed_headers
 
 from clresample.sky import grid as grid_module
-from clresample.sky.box import box_slices, intersect_boxes
+from clresample.sky.box import box_slices, boxes_meet, intersect_boxes
 from clresample.sky.extent import grids_overlap
 from clresample.sky.grid import Grid
 from clresample.sky.wcs import pixel_to_world
@@ -92,3 +92,12 @@ def test_shared_part_of_two_boxes():
         assert a[here].size == b[there].size == 0
         assert a[here].shape == b[there].shape
     assert box_slices(np.array([1, 2]), (3, 4)) == (slice(1, 4), slice(2, 6))
+
+
+def test_boxes_meet_if_they_share_a_pixel():
+    low = np.array([[0, 0], [3, 3], [4, 0], [0, 4], [1, 1]])
+    high = low + [[4, 4], [1, 1], [2, 2], [2, 2], [1, 1]]
+    found = boxes_meet(low, high, low[0], high[0])
+    assert found.tolist() == [True, True, False, False, True]
+    pairs = boxes_meet(low[:, None], high[:, None], low, high)
+    assert pairs.tolist() == pairs.T.tolist() and pairs[0].tolist() == found.tolist()

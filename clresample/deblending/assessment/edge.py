@@ -111,17 +111,12 @@ def _tail(brightness):
 def widened(errors, outside):
     """Errors of fluxes widened by the light outside the observed area (S, C) [counts].
 
-    The error of this light is assumed as large as the light.
+    The error of this light is assumed as large as the light, and common to a source's channels.
     """
-    return replace(with_common_error(errors, outside), outside=outside)
-
-
-def with_common_error(errors, light):
-    """Errors of fluxes that include an error (S, C) [counts] common to a source's channels."""
-    flux, s = errors.flux.copy(), np.arange(len(light))
-    flux[:, s, s] += light.T**2
-    colour = errors.colour + light[:, :, None] * light[:, None, :]
-    return replace(errors, flux=flux, colour=colour)
+    flux, s = errors.flux.copy(), np.arange(len(outside))
+    flux[:, s, s] += outside.T**2
+    colour = errors.colour + outside[:, :, None] * outside[:, None, :]
+    return replace(errors, flux=flux, colour=colour, outside=outside)
 
 
 def reaches_outside(result, flux) -> np.ndarray:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.blas import strmm
 
-from ...sky.box import intersect_boxes
+from ...sky.box import boxes_meet, intersect_boxes
 from ..linear.mode_images import CellImages, ModeImages, cell_sums, subtract, sums_with
 from ..solver.multiscale.prior import MultiscalePrior
 from ..solver.scene import Scene
@@ -247,7 +247,7 @@ class Solution:
         """Light (`_light`) on component i's box: its own, and [(j, light)] of others there."""
         if i not in self._last_lights:
             low, high = self._boxes
-            meet = np.flatnonzero(((low < high[i]) & (high > low[i])).all(1))
+            meet = np.flatnonzero(boxes_meet(low, high, low[i], high[i]))
             beside = [(j, self._light(j, i)) for j in meet if j != i]
             self._last_lights.clear()
             self._last_lights[i] = self._light(i, i), beside

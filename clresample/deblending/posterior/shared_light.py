@@ -37,7 +37,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...sky.box import intersect_boxes
+from ...sky.box import boxes_meet, intersect_boxes
 from ..profiles import GalaxyProfile
 from ..start.population import contamination_factors, is_exact
 from .errors import FluxChanges
@@ -145,7 +145,7 @@ def exchanged_light(result, solution, shapes) -> np.ndarray:
     scene, source = solution.scene, solution.source
     out = np.zeros((n_sources, n_sources, len(result.channels)))
     low, high = scene.origin, scene.origin + [p.shape for p in scene.profile]
-    meet = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
+    meet = boxes_meet(low[:, None], high[:, None], low, high)
     meet &= (source[:, None] != source) & ~scene.fixed
     rings = {j: _isophotes(scene.profile[j]) for j in np.flatnonzero(meet.any(axis=0))}
     structure = {j: [r.without(components[j].morphology) for r in rings[j]] for j in rings}
