@@ -87,7 +87,10 @@ def find_sky(read, good, shape) -> tuple[Background | None, float]:
         for j in columns:
             (y, x), (y1, x1) = ((int(edges[0][i + k]), int(edges[1][j + k])) for k in (0, 1))
             cell = Box(y, x, y1, x1)
-            pixels = read(cell)[good(cell)]
+            try:
+                pixels = read(cell)[good(cell)]
+            except (OSError, ValueError):  # the search of its tile gives the reason
+                continue
             if np.isfinite(pixels).sum() >= MIN_PIXELS:
                 found.append(background(pixels))
     if len(found) < MIN_CELLS:

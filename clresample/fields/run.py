@@ -79,7 +79,6 @@ def run_field(
     if settings.fit_sky == AUTO:
         mosaics = tuple(without_sky(m, notes) for m in mosaics)
         settings = replace(settings, fit_sky=SMALL if notes else AUTO)
-        clock.stop("sky")
     core = whole if options.part is None else field_part(whole, *options.part)
     region = core if options.part is None else core.grown(options.margin_px).intersection(whole)
     engine = make_backend(options, progress)

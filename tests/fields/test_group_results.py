@@ -39,8 +39,8 @@ def part():
         rows.put("reason", np.full(len(rows), reason))
     made = GroupResults(rows=[ok, Columns(), failed])
     made.patches = [
-        (7, 3 << 41, 0, "converged", 2, 600, 20, 0.25),
-        (9, 1, 1, "failed: x", 1, 9, 0, 0.0),
+        (7, 3 << 41, 0, "converged", 2, 600, 20, 0.25, "a | b"),
+        (9, 1, 1, "failed: x", 1, 9, 0, 0.0, ""),
     ]
     return made
 
