@@ -66,7 +66,7 @@ def add_deblend(commands):
         action="store_true",
         help="let every observation but the first move by a constant shift",
     )
-    fit.add_argument("--fit-sky", action="store_true", help="fit a constant in each channel")
+    fit.add_argument("--fit-sky", action="store_true", help="always fit a constant in each channel")
     fit.add_argument(
         "--max-iter", metavar="N", type=non_negative_integer, help="largest number of iterations"
     )
