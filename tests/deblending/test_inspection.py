@@ -113,7 +113,7 @@ def test_a_wrong_sky_frees_those_of_all_observations():
     assert found.settings.fit_sky is True and not found.messages
     np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
     rim, error = np.array([-0.3, -0.05]), np.array([0.02, np.inf])
-    sky = sky_of(np.zeros(2), np.full(2, np.inf), np.zeros(2), rim, error)
+    sky = sky_of(np.full(2, 0.7), np.full(2, np.inf), np.zeros(2), rim, error)
     sky = sky.within(0.1)
     np.testing.assert_allclose([sky.level, sky.error], [[-0.3, 0], [0.02, 0.1]])
 

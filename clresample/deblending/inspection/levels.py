@@ -103,7 +103,7 @@ class SkyLevel:
         """
         below = self.rim < -error
         ends = np.isinf(self.error)
-        level = np.where(ends & below, self.rim, self.level)
+        level = np.where(ends, np.where(below, self.rim, 0), self.level)
         own = np.where(below, np.minimum(self.rim_error, error), error)
         return replace(self, level=level, error=np.where(ends, own, self.error))
 
