@@ -77,7 +77,7 @@ def test_of_a_clean_image_nothing_is_said(seed, kind):
 )
 def test_sky_is_named_with_its_level(sky, words):
     o = observed(image_of(sky=sky * NOISE))
-    for fit_sky, cure in (("auto", "the fit fits it"), (False, "fit_sky=True")):
+    for fit_sky, cure in (("auto", "a constant is fitted"), (False, "fit_sky=True")):
         found = inspected([o], fit_sky=fit_sky)
         (message,) = found.messages
         assert words in message and "g " in message and cure in message
@@ -141,6 +141,7 @@ def test_wings_are_no_sky():
     assert (np.abs(level.level) < 3 * level.error).all() and (level.rim > 0.4 * NOISE).all()
     (message,) = inspected([o], source).messages
     assert "the pixels furthest from the sources are not dark" in message
+    assert inspected([o], source, fit_sky="small").messages == []
 
 
 @pytest.mark.parametrize("width, declared", [(0.0, None), (0.6, None), (0.6, "estimate")])

@@ -78,7 +78,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
     auto, small = settings.fit_sky == AUTO, settings.fit_sky == SMALL
-    fit_sky = free = bool(settings.fit_sky) and not (auto or small)
+    free = not (auto or small) and bool(settings.fit_sky)
+    fit_sky = free or small
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
@@ -87,6 +88,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         about, wrong = (
             (_unsure_lines(image, sky), False) if free else _level_lines(image, sky, auto or small)
         )
+        if small and not wrong:
+            about = []  # what is left is fitted
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
@@ -96,7 +99,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         if wide.any():
             sky, about, wrong = replace(sky, error=np.full_like(sky.error, np.inf)), [], False
         levels.append(sky)
-        fit_sky = fit_sky or small or (wrong and auto)
+        fit_sky = fit_sky or (wrong and auto)
         lines = _unmeasured(image) + about + ([] if wide.any() else noise_lines(image, sky))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
@@ -146,10 +149,10 @@ def _unmeasured(image):
     ]
 
 
-def _level_lines(image, sky, auto):
+def _level_lines(image, sky, fitted):
     """Messages about a SkyLevel other than zero, and about light at the rim.
 
-    Also returns True if the level is certainly not zero. auto: True if it is fitted then
+    Also returns True if the level is certainly not zero. fitted: True if it is fitted then
     """
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known, doubt = np.isfinite(error), False
@@ -176,9 +179,9 @@ def _level_lines(image, sky, auto):
                 f"{what}: pixels without a source have the level {_parts(image, level, chosen)}"
                 " a pixel; "
                 + (
-                    "the fit fits it, near this level"
-                    if auto
-                    else f"every flux holds its share of it; {cure}, or give fit_sky=True"
+                    "a constant is fitted near this level"
+                    if fitted
+                    else f"every flux includes its share of it; {cure}, or give fit_sky=True"
                 )
             )
     if lines or not np.isfinite(rim_error).all():
@@ -187,14 +190,14 @@ def _level_lines(image, sky, auto):
         lines.append(
             "the pixels furthest from the sources are not dark, "
             f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
-            "end beyond the image, and fluxes hold a part of it; give fit_sky=True or a larger "
+            "end beyond the image, and fluxes include a part of it; give fit_sky=True or a larger "
             "image"
         )
     elif doubt:
         lines.append(
             "the sky's level is unsure, as the sources' wings reach all over the image: "
             f"{_parts(image, sky.level, known)} a pixel, +- {error[known].mean():.2g} sigma, and "
-            "every flux holds its share of it; give fit_sky=True or a larger image"
+            "every flux includes its share of it; give fit_sky=True or a larger image"
         )
     return lines, False
 
