@@ -79,7 +79,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
     auto, small = settings.fit_sky == AUTO, settings.fit_sky == SMALL
     free = not (auto or small) and bool(settings.fit_sky)
-    fit_sky = free or small
+    fit_sky = False
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
@@ -93,13 +93,15 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        image, wide, own = with_star_psfs(image, sources, free or small or (wrong and auto), free)
+        fitted = free or small or (auto and wrong)
+        image, wide, own = with_star_psfs(image, sources, fitted, free)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         if wide.any():
-            sky, about, wrong = replace(sky, error=np.full_like(sky.error, np.inf)), [], False
+            sky, about = replace(sky, error=np.full_like(sky.error, np.inf)), []
+            fitted = free or small
         levels.append(sky)
-        fit_sky = fit_sky or (wrong and auto)
+        fit_sky = fit_sky or fitted
         lines = _unmeasured(image) + about + ([] if wide.any() else noise_lines(image, sky))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))

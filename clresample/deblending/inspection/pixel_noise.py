@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .levels import SIGMAS_A_MAD
+
 # [1] Smallest correlation of neighbouring pixels that is reported. In 280 channels of simulated
 # white noise it is 0.09 at most, 0.27 to 0.34 drizzled, 0.42 to 0.49 resampled by Lanczos, and 0.21
 # to 0.31 in coadds of HSC.
@@ -20,7 +22,6 @@ MIN_PIXELS = 1000
 FAR_PX = 8
 # [sigma] Pixels that deviate more are faint sources or defects.
 CLIP = 4.0
-SIGMAS_A_MAD = 1.4826  # of a Gaussian
 
 
 def noise_lines(image, sky) -> list[str]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ....sky.box import Box
+from ....sky.box import Box, boxes_meet
 from .inverse import seen_through
 from .scale_direction import coefficients_of
 
@@ -53,7 +53,7 @@ def find_exchange_directions(scene, state, evidence, strengths):
     boxes = [Box.at(low, m.shape) for low, m in zip(scene.origin, state.morph, strict=True)]
     low, shines = np.asarray(scene.origin), (state.spectra > 0).astype(np.float32)
     high = low + [m.shape for m in state.morph]
-    meet = (np.maximum(low[:, None], low) < np.minimum(high[:, None], high)).all(axis=2)
+    meet = boxes_meet(low[:, None], high[:, None], low, high)
     meet &= (shines @ shines.T > 0) & ~np.eye(len(low), dtype=bool) & ~scene.fixed[:, None]
     pairs = np.argwhere(meet).tolist()
     found = [_direction(scene, state, boxes, pair, evidence, strengths) for pair in pairs]
