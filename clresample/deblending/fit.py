@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ..device.rounding import round_up
-from ..resampling.transfer import noise_warnings
+from ..resampling.transfer import floor_warnings
 from ..sky.frame import Frame
 from .component_images import ComponentImages
 from .ended import Ended
@@ -77,7 +77,8 @@ class Fit:
         if private:
             self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
-            self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.certificate)]
+            # models have no noise to amplify
+            self.messages += [f"{o.label}: {line}" for line in floor_warnings(view.op.certificate)]
         if not any(view.sqrt_weights.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate([view.noise_unit for view in self.views])

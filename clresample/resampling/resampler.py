@@ -18,7 +18,7 @@ from .executor import Executor
 from .folded import FoldedExecutor
 from .grid_operator import GridOperator
 from .plan import Precision, ResamplingPlan, make_resampling_plan
-from .transfer import noise_warnings
+from .transfer import floor_warnings, gain_warnings
 
 EXECUTORS = {"aligned": AlignedExecutor, "affine": AffineExecutor, "distorted": DistortedExecutor}
 
@@ -83,7 +83,7 @@ class Resampler(GridOperator):
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """The plan of a mapping, with its warnings, and its tables on the device."""
         plan = make_resampling_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
-        for message in noise_warnings(plan.certificate):
+        for message in gain_warnings(plan.certificate) + floor_warnings(plan.certificate):
             warnings.warn(message, PSFWarning, stacklevel=3)
         self._take([plan], dtype, device, folds=True)
 

@@ -52,21 +52,26 @@ class Certificate(CertificateDisplay):
         )
 
 
-def noise_warnings(certificate: Certificate) -> list[str]:
-    """Warnings about a difference kernel that amplifies noise or was floored, a line each."""
-    gain, floored = certificate.max_gain.max(), certificate.floored_power.max()
-    lines = []
-    if gain > NOISY_GAIN:
-        lines.append(
-            f"the difference kernel amplifies some frequencies {gain:.3g} times, and noise "
-            "with them: the model's PSF is wider there than the observation's"
-        )
-    if floored > FLOORED_POWER:
-        lines.append(
-            f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
-            f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
-        )
-    return lines
+def gain_warnings(certificate: Certificate) -> list[str]:
+    """Warnings about a difference kernel that amplifies the noise of images it is applied to."""
+    gain = certificate.max_gain.max()
+    if gain <= NOISY_GAIN:
+        return []
+    return [
+        f"the difference kernel amplifies some frequencies {gain:.3g} times, and noise "
+        "with them: the model's PSF is wider there than the observation's"
+    ]
+
+
+def floor_warnings(certificate: Certificate) -> list[str]:
+    """Warnings about a difference kernel whose division was floored."""
+    floored = certificate.floored_power.max()
+    if floored <= FLOORED_POWER:
+        return []
+    return [
+        f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
+        f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
+    ]
 
 
 def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:

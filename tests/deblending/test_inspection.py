@@ -268,6 +268,28 @@ def test_light_without_a_source_is_named():
     assert listing.unlisted(looked_at(o)) == []
 
 
+def test_light_of_masked_pixels_and_beyond_the_edge_is_not_unlisted():
+    """Wings of a galaxy whose body is masked, cut off, or outside of the frame."""
+    masked = np.zeros(SHAPE, bool)
+    y, x = np.indices(SHAPE)
+    masked[np.hypot(y - DRAWN[0][0][0], x - DRAWN[0][0][1]) < 4] = True
+    o = observed(image_of(), weights=np.where(masked, 0, NOISE**-2) * np.ones((2, 1, 1)))
+    rest = sources_of(DRAWN[1:])
+    assert looked_at(o, rest).smooth.max() > 5 * listing.UNLISTED_SIGMAS
+    assert listing.unlisted(looked_at(o, rest)) == []
+    beside = ((0.2, 18.7), *DRAWN[0][1:])
+    o = observed(image_of((beside, *DRAWN[1:])))
+    assert listing.unlisted(looked_at(o, rest)) == []
+    o = observed(image_of())
+    (found,) = listing.unlisted(looked_at(o, rest))
+    assert found[1:] == (20, 19)
+    frame = model_frame([o], grid=o.grid.cutout(22, 0, (42, 60)))
+    places = frame.positions_of(
+        tuple(ExtendedSource(position_px=(a - 22, b)) for (a, b), *_ in DRAWN[1:])
+    )
+    assert listing.unlisted(InspectedImage.of(o, frame, places, np.zeros(2))) == []
+
+
 def test_doubles_are_named_unless_of_two_kinds():
     o, near = observed(image_of()), DRAWN[0][0][0] + 0.6
     twin = ExtendedSource(position_px=(near, DRAWN[0][0][1]))

@@ -12,7 +12,7 @@ from clresample.resampling import resampler
 from clresample.resampling.grid_operator import GridOperator
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.tiled.resampler import TiledResampler
-from clresample.resampling.transfer import Certificate, noise_warnings
+from clresample.resampling.transfer import Certificate, floor_warnings
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
 
@@ -81,7 +81,7 @@ def test_the_certificate_names_what_was_found(device, kind):
     assert all(0 < h <= (k + 1) // 2 for h, k in zip(found.n_frequencies, found.n_fft, strict=True))
     assert all(5 < radius < 60 for radius in found.wrap_radius_px)
     np.testing.assert_allclose(found.max_gain, (1, 1), rtol=1e-6)
-    assert found.floored_power.shape == (2,) and not noise_warnings(found)
+    assert found.floored_power.shape == (2,) and not floor_warnings(found)
     with pytest.raises(AttributeError):
         found.n_fft = (1, 1)
     for figure in (f"K = {found.n_fft[0]}, {found.n_fft[1]}", "gain <= 1;", "px", "0.00%"):

@@ -13,7 +13,8 @@ from clresample.resampling.transfer import (
     NOISY_GAIN,
     WRAP_MARGIN,
     Certificate,
-    noise_warnings,
+    floor_warnings,
+    gain_warnings,
     transfer_function,
     wrap_radius,
 )
@@ -65,12 +66,12 @@ def certificate(gain, floored):
 
 
 def test_what_is_warned_of():
-    assert noise_warnings(certificate(NOISY_GAIN, FLOORED_POWER)) == []
-    (gain,) = noise_warnings(certificate(12.345, 0))
+    assert gain_warnings(certificate(NOISY_GAIN, 0.25)) == []
+    assert floor_warnings(certificate(3, FLOORED_POWER)) == []
+    (gain,) = gain_warnings(certificate(12.345, 0))
     assert "amplifies some frequencies 12.3 times" in gain
-    (floored,) = noise_warnings(certificate(1, 0.25))
+    (floored,) = floor_warnings(certificate(1, 0.25))
     assert "25.00%" in floored and "the division is floored" in floored
-    assert len(noise_warnings(certificate(3, 0.25))) == 2
 
 
 def test_wrap_radius_of_turned_pixels_that_are_not_square():

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...sky.box import Box
 from ...sky.observation import Observation, masked
 
 # [pixels] Number of weights, evenly spread over the image, whose median gives the noise of a
@@ -31,6 +32,7 @@ class InspectedImage:
     places (S, 2) [px]: of the sources; inside (S,): bool, those on a pixel of the image
     listed (S, 2) [px]: of the sources without the observation's shift
     matrix (2, 2), offset (2,): p = matrix X + offset, from model pixels to observed ones
+    frame_shape (2,) [model px]: of the Frame
     """
 
     observation: Observation
@@ -42,6 +44,7 @@ class InspectedImage:
     listed: np.ndarray
     matrix: np.ndarray
     offset: np.ndarray
+    frame_shape: tuple[int, int]
 
     @classmethod
     def of(cls, observation, frame, positions, shift) -> InspectedImage:
@@ -65,7 +68,8 @@ class InspectedImage:
         matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0  # upright grids stay upright
         offset = solution[2] - matrix @ shift
         level = np.zeros(len(sigma))
-        return cls(observation, usable, sigma, level, places, inside, listed, matrix, offset)
+        given = places, inside, listed, matrix, offset, frame.shape
+        return cls(observation, usable, sigma, level, *given)
 
     def over(self, level) -> InspectedImage:
         """The same InspectedImage with the level (C,) [counts] of its sky known."""
@@ -117,9 +121,17 @@ class InspectedImage:
         """FWHM [px] of the PSF, the median of the channels'."""
         return float(np.median(self.observation.psf.fwhm_px))
 
+    def in_model(self, points) -> np.ndarray:
+        """Points (..., 2) [px] of the image in model pixels."""
+        return (points - self.offset) @ np.linalg.inv(self.matrix).T
+
+    def on_frame(self, points) -> np.ndarray:
+        """Selects points (..., 2) [px] on a pixel of the frame."""
+        return Box.of(self.frame_shape).contains(self.in_model(points))
+
     def model_places(self, chosen) -> np.ndarray:
         """Places (n, 2) [model px] of sources `chosen` (n,)."""
-        return (self.places[chosen] - self.offset) @ np.linalg.inv(self.matrix).T
+        return self.in_model(self.places[chosen])
 
     def patches(self, chosen, reach):
         """Pixel numbers (n, h, h) [px] in y and in x about the places of sources `chosen` (n,).

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from .centroids import common, over_channels
 
@@ -17,7 +18,8 @@ UNLISTED_SIGMAS = 10.0
 UNLISTED_PART = 0.25
 # [FWHM of the PSF] Light nearer to a listed source belongs to it; at least in pixels.
 OWN_FWHM, OWN_PX = 1.5, 3.0
-# [1] of a peak: light that stays above this level up to a listed source belongs to that source.
+# [1] of a peak: light that stays above this level up to a listed source belongs to that source, up
+# to a masked pixel or the edge to what lies there.
 SADDLE_PART = 0.5
 N_NEAREST = 6  # number of the nearest sources that light may belong to
 # [px], [sigma] Smallest common offset of all positions that is reported, and its significance.
@@ -58,13 +60,17 @@ def common_offset(found):
 def unlisted(image):
     """Peaks [(significance [sigma], y, x [px])] without a source at them, the brightest first."""
     peaks = _peaks(image.smooth)
+    peaks = peaks[image.on_frame(peaks)]  # other pixels are not fitted
     if not len(peaks):
         return []
     places = image.places[np.isfinite(image.places).all(axis=1)]
     if not image.inside.any():
         return []  # sources all lie outside, which is reported by itself
     # masked pixels may be of any brightness
-    smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
+    usable = np.pad(image.usable.all(axis=0), 1)
+    smooth = np.where(usable[1:-1, 1:-1], image.smooth, np.inf)
+    indices = distance_transform_edt(usable, return_distances=False, return_indices=True)
+    unseen = np.moveaxis(indices[:, 1:-1, 1:-1], 0, -1) - 1
     own = max(OWN_FWHM * image.width_px, OWN_PX)
     least = UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
     found = []
@@ -73,7 +79,7 @@ def unlisted(image):
         away = np.hypot(*(places - (y, x)).T)
         if value < least or away.min() < own:
             continue
-        nearest = places[away.argsort()[:N_NEAREST]]
+        nearest = [unseen[y, x], *places[away.argsort()[:N_NEAREST]]]
         if not any(_joined(smooth, (y, x), value, place) for place in nearest):
             found.append((float(value), int(y), int(x)))
     return sorted(found, reverse=True)

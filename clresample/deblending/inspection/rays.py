@@ -31,7 +31,7 @@ def without_rays(observations, frame) -> tuple:
         sharp = sharper_than_psf(image)
         rays = np.zeros_like(sharp)
         for c, y, x in np.argwhere(sharp):
-            place = (np.array([y, x]) - image.offset) @ np.linalg.inv(image.matrix).T
+            place = image.in_model(np.array([y, x]))
             peaks = [
                 _has_peak(other, band, other.matrix @ place + other.offset)
                 for other in images

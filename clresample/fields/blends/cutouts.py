@@ -22,7 +22,8 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None)
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
     patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
-    labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on
+    labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on, also of
+        those `beyond_px` around the patch's box
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None = their pixels are ignored, like those of
         all other blends
@@ -31,7 +32,8 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None)
     pixels that cannot be read.
     """
     grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
-    foreign = _foreign(patch, labels, corner, neighbours is not None)
+    foreign = _foreign(patch, labels, neighbours is not None)
+    first = np.array(corner) - patch.box[:2]
     observations, boxes = [], {}
     for mosaic in mosaics:
         box = fit_box(mosaic, grid)
@@ -43,7 +45,7 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None)
         cut = mosaic.grid.cutout(box.y0, box.x0, box.shape)
         seen = mosaic.observation(
             box,
-            ignore=_foreign_pixels(cut, grid, foreign),
+            ignore=_foreign_pixels(cut, grid, foreign, first),
             subtract=light,
             extra=None if light is None else (MODEL_ERROR * light) ** 2,
             grid=cut,
@@ -99,27 +101,34 @@ def fit_box(mosaic, grid) -> Box:
     return box_within(there, margin, SIDE_PX, Box.of(mosaic.grid.shape))
 
 
-def _foreign(patch, labels, corner, siblings_too):
-    """Pixels of the patch's box that belong to other patches: (Ny, Nx) bool.
+def beyond_px(mosaics, reference) -> int:
+    """Largest distance [px] in the model's pixels from a patch's box to pixels of its cutouts.
+
+    `fit_box` adds pixels of a mosaic: a margin, and up to a multiple of SIDE_PX.
+    """
+    coarsest = max(mosaic.grid.pixel_scale_arcsec for mosaic in mosaics)
+    return int(np.ceil((SIDE_PX + 1) * coarsest / reference.pixel_scale_arcsec)) + 1
+
+
+def _foreign(patch, labels, siblings_too):
+    """Pixels of labels (Ny, Nx) that belong to other patches: (Ny, Nx) bool.
 
     siblings_too: False = without those of its own blend's other pieces, whose light is subtracted
     """
-    y, x = corner
-    box = Box(patch.box.y0 - y, patch.box.x0 - x, patch.box.y1 - y, patch.box.x1 - x)
-    there = box.intersection(Box.of(labels.shape))
-    own = np.zeros(patch.box.shape, labels.dtype)
-    own[there.relative_to(box).slices] = labels[there.slices]
     known = [0, patch.number + 1]
     if siblings_too:
         known += [k + 1 for k in patch.siblings]
-    return ~np.isin(own, known)
+    return ~np.isin(labels, known)
 
 
-def _foreign_pixels(cut, grid, foreign):
-    """Pixels (My, Mx) of an observation's grid whose centre lies on a foreign one of the frame."""
+def _foreign_pixels(cut, grid, foreign, first):
+    """Pixels (My, Mx) of an observation's grid whose centre lies on a foreign one.
+
+    grid: of the frame; foreign (Ny, Nx): from its pixel `first` (2,) [px] on
+    """
     mapping = cut.map_to(grid)
     n, m = np.indices(cut.shape)
-    at = np.floor(mapping.at(n, m) + 0.5).astype(int)
+    at = np.floor(mapping.at(n, m) + 0.5).astype(int) - first
     inside = ((at >= 0) & (at < np.array(foreign.shape))).all(axis=-1)
     at = np.clip(at, 0, np.array(foreign.shape) - 1)
     return inside & foreign[at[..., 0], at[..., 1]]

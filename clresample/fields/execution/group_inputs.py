@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.box import Box
+from ..blends.cutouts import beyond_px
 from .group_results import GroupResultsFile
 
 
@@ -35,8 +36,8 @@ class FitGroup:
 class GroupInputs:
     """Inputs of a group's fits beside the mosaics.
 
-    labels {patch: (corner (2,) [px], (Ny, Nx) int32)}: patch numbers + 1 of its box's pixels, from
-        the model pixel `corner` on
+    labels {patch: (corner (2,) [px], (Ny, Nx) int32)}: patch numbers + 1 of the pixels of its
+        cutouts, from the model pixel `corner` on
     light {patch: {mosaic's name: [(Box, model (C, Ny, Nx) [counts])]}}: of the neighbours; None in
         the first round, where their pixels are ignored
     before {patch: (profiles, structures)}: of the last fits, {id: of each component}, see
@@ -52,9 +53,9 @@ def gather_inputs(job, group) -> GroupInputs:
     """Reads the inputs of a group from the run's folder. Raises FileError, OSError."""
     whole = np.load(job.folder / "labels.npy", mmap_mode="r")
     region = Box.of(whole.shape)
-    labels = {}
+    labels, beyond = {}, beyond_px(job.mosaics, job.reference)
     for number in group.patches:
-        box, (y, x) = job.plan.patches[number].box, job.origin_px
+        box, (y, x) = job.plan.patches[number].box.grown(beyond), job.origin_px
         there = Box(box.y0 - y, box.x0 - x, box.y1 - y, box.x1 - x).intersection(region)
         corner = there.y0 + y, there.x0 + x
         labels[number] = corner, np.array(whole[there.slices])
