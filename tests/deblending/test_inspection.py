@@ -7,7 +7,13 @@ from clresample.deblending.blend import Blend
 from clresample.deblending.inspection import disagreement, levels, listing, shifted, spoilt
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
-from clresample.deblending.inspection.inspect import LEVEL_PART, _level_lines, inspect
+from clresample.deblending.inspection.inspect import (
+    HELD_PART,
+    SMALL_PART,
+    _level_lines,
+    _shown_levels,
+    inspect,
+)
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
@@ -95,27 +101,37 @@ def test_a_rim_below_zero_is_no_light():
     source = (ExtendedSource(position_px=(23.5, 23.5)),)
     level = levels.sky_level(looked_at(o, source))
     assert (level.rim < -0.3 * NOISE).all() and (np.abs(level.level) < 4 * level.error).all()
-    (message,) = inspected([o], source).messages
-    assert "too much sky was subtracted" in message and f"{level.rim[0]:+.4g} counts" in message
+    found = inspected([o], source)
+    (message,), expected = found.messages, found.levels[0].level[0]
+    assert "too much sky was subtracted" in message and f"{expected:+.4g} counts" in message
+    assert expected <= level.rim[0]
     (message,) = inspected([o], source, fit_sky=True).messages
     assert "hardly tell its level" in message and "g +- " in message
 
 
 def test_a_wrong_sky_frees_those_of_all_observations():
-    """Unknown ones within a tenth of a pixel's noise, or as their rims are below zero."""
+    """Levels of other observations are held at 0; of nearly subtracted skies, all are near 0."""
     good, small = observed(image_of()), observed(image_of(shape=(5, 5)), channels=("i", "z"))
-    found = inspected([good, small])
-    assert found.settings.fit_sky is False and np.isinf(found.levels[1].error).all()
+    assert inspected([good, small]).settings.fit_sky is False
     found = inspected([observed(image_of(sky=0.3 * NOISE)), small])
     assert found.settings.fit_sky is True and not found.levels[1].level.any()
-    np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
+    np.testing.assert_allclose(found.levels[0].level, 0.3 * NOISE, rtol=0.2)
+    np.testing.assert_allclose(found.levels[1].error, HELD_PART * NOISE, rtol=0.3)
     found = inspected([good, small], fit_sky="small")
     assert found.settings.fit_sky is True and not found.messages
-    np.testing.assert_allclose(found.levels[1].error, LEVEL_PART * NOISE, rtol=0.3)
-    rim, error = np.array([-0.3, -0.05]), np.array([0.02, np.inf])
-    sky = sky_of(np.full(2, 0.7), np.full(2, np.inf), np.zeros(2), rim, error)
-    sky = sky.within(0.1)
-    np.testing.assert_allclose([sky.level, sky.error], [[-0.3, 0], [0.02, 0.1]])
+    np.testing.assert_allclose(found.levels[1].error, SMALL_PART * NOISE, rtol=0.3)
+    assert (np.abs(found.levels[0].level) < SMALL_PART * NOISE).all()
+
+
+def test_levels_that_are_not_shown_are_near_zero_and_others_as_measured_or_as_the_rim():
+    endless, zeros = np.full(6, np.inf), np.zeros(6)
+    level, error = np.array([0.7, 0.7, 0.0, 0.0, -0.7, -0.2]), np.array([1, 1, 1e300, 1e300, 1, 1])
+    error[2:4] = endless[2:4]
+    rim, rim_error = np.array([0.9, 0.9, -0.3, -0.3, -0.3, -0.3]), np.full(6, 0.02)
+    sky = levels.SkyLevel(level, error, zeros, rim, rim_error, None, None, zeros)
+    sky = sky.expected(np.array([True, False, True, False, True, True]), np.full(6, 0.1))
+    np.testing.assert_allclose(sky.level, [0.7, 0.7 / 101, -0.3, 0, -0.7, -0.3])
+    np.testing.assert_allclose(sky.error, [1, np.sqrt(1 / 101), 0.02, 0.1, 1, 0.02])
 
 
 def test_a_level_under_wings_may_be_wrong():
@@ -124,9 +140,10 @@ def test_a_level_under_wings_may_be_wrong():
     for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
         sky = sky_of(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
-        found.append(_level_lines(looked_at(o), sky, True))
-    ((line,), *others), wrong = zip(*found, strict=True)
-    assert not any(wrong)
+        shown = _shown_levels(looked_at(o), sky)
+        assert not shown.any()
+        found.append(_level_lines(looked_at(o), sky, shown, sky, False))
+    (line,), *others = found
     assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line
     assert others == [[], []]
 
@@ -141,7 +158,7 @@ def test_wings_are_no_sky():
     assert (np.abs(level.level) < 3 * level.error).all() and (level.rim > 0.4 * NOISE).all()
     (message,) = inspected([o], source).messages
     assert "the pixels furthest from the sources are not dark" in message
-    assert inspected([o], source, fit_sky="small").messages == []
+    assert inspected([o], source, fit_sky="small").messages == [message]
 
 
 @pytest.mark.parametrize("width, declared", [(0.0, None), (0.6, None), (0.6, "estimate")])

@@ -28,6 +28,10 @@ RIM_PART, RIM_SIGMAS = 0.4, 2.0
 # errors and this fraction of a pixel's noise: none of 400 clean simulated images reaches two
 # thirds.
 DOUBT_SIGMAS, DOUBT_PART = 1.5, 0.3
+# Fraction of a pixel's noise by which a fitted level may differ from 0 where it is not shown to: in
+# observations with another level that is, where nearly all of the sky was subtracted ("small"), and
+# in observations whose sky is not fitted while that of others is.
+SMALL_PART, HELD_PART = 0.05, 1e-3
 # Fraction of a pixel's noise above which the error of a fitted sky level is reported: it changes a
 # flux measured on 50 pixels by its own error.
 UNSURE_PART = 0.15
@@ -59,7 +63,7 @@ class Inspection:
     settings: FitSettings with fit_shifts and fit_sky decided
     shifts (n_observations, 2) [model px]: of the observations, from which a fit of them starts
     messages: a sentence for each problem
-    levels: SkyLevel of each observation
+    levels: SkyLevel of each observation, that of a fit if the sky is fitted
     """
 
     blend: Blend
@@ -85,24 +89,30 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image = InspectedImage.of(observation, frame, positions[near], shift)
         sky = sky_level(image)
         image = image.over(sky.level)
-        about, wrong = (
-            (_unsure_lines(image, sky), False) if free else _level_lines(image, sky, auto or small)
-        )
-        if small and not wrong:
-            about = []  # what is left is fitted
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        fitted = free or small or (auto and wrong)
+        shown = _shown_levels(image, sky)
+        fitted = free or small or (auto and bool(shown.any()))
         image, wide, own = with_star_psfs(image, sources, fitted, free)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
-        if wide.any():
-            sky, about = replace(sky, error=np.full_like(sky.error, np.inf)), []
-            fitted = free or small
-        levels.append(sky)
+        unknown = bool(wide.any())
+        if unknown:
+            sky = replace(sky, error=np.full_like(sky.error, np.inf))
+            fitted, shown = free or small, np.zeros_like(shown)
+        part = SMALL_PART if small else LEVEL_PART if fitted else HELD_PART
+        expected = sky if free else sky.expected(shown, part * image.sigma)
+        levels.append((sky, expected))
         fit_sky = fit_sky or fitted
-        lines = _unmeasured(image) + about + ([] if wide.any() else noise_lines(image, sky))
+        lines = _unmeasured(image)
+        if not unknown:
+            about = (
+                _unsure_lines(image, sky)
+                if free
+                else _level_lines(image, sky, shown, expected, fitted)
+            )
+            lines += about + noise_lines(image, sky)
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)
@@ -120,10 +130,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
-    if fit_sky and not free:
-        pairs = zip(levels, images, strict=True)
-        levels = [sky.within(LEVEL_PART * image.sigma) for sky, image in pairs]
     settings = replace(settings, fit_shifts=move, fit_sky=fit_sky)
+    levels = [pair[fit_sky] for pair in levels]
     return Inspection(blend, settings, shifts, messages + lines, levels)
 
 
@@ -151,43 +159,63 @@ def _unmeasured(image):
     ]
 
 
-def _level_lines(image, sky, fitted):
+def _shown_levels(image, sky):
+    """Selects channels (C,) whose sky is certainly not zero: by their SkyLevel, or a dark rim."""
+    part, error = sky.level / image.sigma, sky.error / image.sigma
+    known = np.isfinite(error)
+    wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
+    mean, total = _common_level(image, sky)
+    if abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART):
+        wrong |= known & (part * mean > 0)
+    return wrong | _dark_rim(image, sky)
+
+
+def _common_level(image, sky):
+    """Mean of the known levels and its error [1], in units of the pixels' noise.
+
+    The uncertainty from wings is common to all channels.
+    """
+    known = np.isfinite(sky.error)
+    if not known.any():
+        return 0.0, np.inf
+    part, error, wings = (v[known] / image.sigma[known] for v in (sky.level, sky.error, sky.wings))
+    own = np.maximum(error**2 - wings**2, 0).sum()
+    return part.mean(), np.hypot(wings.mean(), np.sqrt(own) / len(part))
+
+
+def _dark_rim(image, sky):
+    """Selects channels (C,) whose rim is below zero: light is positive, so the sky is too dark."""
+    rim, error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    return rim < -np.maximum(LEVEL_SIGMAS * error, LEVEL_PART)
+
+
+def _level_lines(image, sky, shown, expected, fitted):
     """Messages about a SkyLevel other than zero, and about light at the rim.
 
-    Also returns True if the level is certainly not zero. fitted: True if it is fitted then
+    shown (C,): bool, channels by `_shown_levels`; expected: SkyLevel of the fit; fitted: True if it
+        is fitted
     """
-    part, error = sky.level / image.sigma, sky.error / image.sigma
-    known, doubt = np.isfinite(error), False
-    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
-    unsure = RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim))
-    wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
-    if known.any():  # all channels together: the uncertainty from wings is common to them
-        mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
-        own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
-        total = np.hypot(shared, np.sqrt(own) / known.sum())
-        wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
-        doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART)
-        doubt &= mean > 0 or rim.mean() < -unsure
-    # light is positive: a rim below zero is over-subtracted sky; a rim above it may be wings
-    below = rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART)
-    level = np.where(below & ~(wrong & (part < 0)), sky.rim, sky.level)
     lines = []
     for chosen, what, cure in (
-        (wrong & (part > 0) & ~below, "sky is left in", "subtract it"),
-        (below, "too much sky was subtracted", "add it back"),
+        (shown & (expected.level > 0), "sky is left in", "subtract it"),
+        (shown & (expected.level < 0), "too much sky was subtracted", "add it back"),
     ):
         if chosen.any():
             lines.append(
-                f"{what}: pixels without a source have the level {_parts(image, level, chosen)}"
-                " a pixel; "
+                f"{what}: pixels without a source have the level "
+                f"{_parts(image, expected.level, chosen)} a pixel; "
                 + (
                     "a constant is fitted near this level"
                     if fitted
                     else f"every flux includes its share of it; {cure}, or give fit_sky=True"
                 )
             )
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
     if lines or not np.isfinite(rim_error).all():
-        return lines, bool(lines)
+        return lines
+    unsure = RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim))
+    mean, total = _common_level(image, sky)
+    doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART) and (mean > 0 or rim.mean() < -unsure)
     if rim.mean() > RIM_PART + unsure:
         lines.append(
             "the pixels furthest from the sources are not dark, "
@@ -196,12 +224,14 @@ def _level_lines(image, sky, fitted):
             "image"
         )
     elif doubt:
+        known = np.isfinite(sky.error)
         lines.append(
             "the sky's level is unsure, as the sources' wings reach all over the image: "
-            f"{_parts(image, sky.level, known)} a pixel, +- {error[known].mean():.2g} sigma, and "
+            f"{_parts(image, sky.level, known)} a pixel, +- "
+            f"{(sky.error / image.sigma)[known].mean():.2g} sigma, and "
             "every flux includes its share of it; give fit_sky=True or a larger image"
         )
-    return lines, False
+    return lines
 
 
 def _unsure_lines(image, sky):

@@ -96,16 +96,19 @@ class SkyLevel:
     dark: np.ndarray
     block_scatter: np.ndarray
 
-    def within(self, error) -> SkyLevel:
-        """The SkyLevel with unknown levels replaced by those of the rim, if they are below zero.
+    def expected(self, shown, width) -> SkyLevel:
+        """The SkyLevel that a fit expects in channels `shown` (C,) not to be at 0, and in others.
 
-        Others become 0, with an error (C,) [counts].
+        The former are as measured, or as their rim if it is below a level that is uncertain by more
+        than `width` (C,) [counts]. The others are measured too, and expected within `width` of 0: a
+        larger error would leave the light of wide sources to the sky.
         """
-        below = self.rim < -error
-        ends = np.isinf(self.error)
-        level = np.where(ends, np.where(below, self.rim, 0), self.level)
-        own = np.where(below, np.minimum(self.rim_error, error), error)
-        return replace(self, level=level, error=np.where(ends, own, self.error))
+        dark = shown & (self.rim < np.minimum(self.level, 0)) & (self.error > width)
+        level = np.where(dark, self.rim, self.level)
+        error = np.where(dark, np.minimum(self.rim_error, width), self.error)
+        part = np.where(shown, 1, width**2 / (width**2 + np.minimum(error, 1e150) ** 2))
+        error = np.where(shown, error, np.sqrt(part) * np.minimum(error, 1e150))
+        return replace(self, level=part * level, error=error)
 
 
 def sky_level(image) -> SkyLevel:
