@@ -25,6 +25,9 @@ from .field_toml.field_file import read_field
 from .light import REACH_FWHM, ModelLight
 from .models import ModelFile
 from .reference import reference_grid
+from .sky_level import without_sky
+
+PROVENANCE = "provenance.json"
 
 
 class FieldCutouts:
@@ -59,7 +62,8 @@ class FieldCutouts:
         self.group_ids = self._columns.get("group_id", self.ids).astype(np.int64)
         self._row = {one: row for row, one in enumerate(self.ids.tolist())}
         self._models = ModelFile(self.folder / "models.fits")
-        self.mosaics = tuple(self._read_mosaics() if mosaics is None else mosaics)
+        mosaics = tuple(self._read_mosaics() if mosaics is None else mosaics)
+        self.mosaics = without_sky(mosaics, self._provenance().get("sky_levels", {}))
         names = tuple(c.name for m in self.mosaics for c in m.channels)
         if names != self._models.channels:
             raise FileError(
@@ -71,23 +75,31 @@ class FieldCutouts:
 
     def _read_mosaics(self):
         """Reads the mosaics of the run's field file."""
-        path = self.folder / "provenance.json"
+        about = self._provenance()
         try:
-            about = json.loads(path.read_text())
             given = Path(about["inputs"]["field"]["file"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (KeyError, TypeError):
             raise FileError(
-                f"{path}: names no field file: give the mosaics that the run was made with"
+                f"{self.folder / PROVENANCE}: names no field file: give the mosaics that the run "
+                "was made with"
             ) from None
         places = [given, self.folder.absolute().parent / given.name, self.folder / given.name]
         found = next((place for place in places if place.is_file()), None)
         if found is None:
             raise FileError(
-                f"{path}: its field file {given} is not there: put it back, or give the mosaics"
+                f"{self.folder / PROVENANCE}: its field file {given} is not there: put it back, or "
+                "give the mosaics"
             )
         field = read_field(found)
         self._note_changes(about, field.inputs)
         return field.mosaics
+
+    def _provenance(self) -> dict:
+        """The provenance of the run; empty if it is not there."""
+        try:
+            return json.loads((self.folder / PROVENANCE).read_text())
+        except (OSError, ValueError):
+            return {}
 
     def _note_changes(self, about, inputs):
         """Records inputs whose size or date differs from those of the run."""

@@ -14,7 +14,7 @@ from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
 from ..sky.validation.observed import as_psf
 from ..sky.varying_psf.field import PSFField
-from .background import Background
+from .background import Background, ConstantBackground
 from .psfs.combined import ConstantPSF
 from .strips import FilePlane as FilePlane  # beside the other kinds of Plane
 
@@ -58,7 +58,7 @@ class Channel:
         or "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
     mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
     zero_point [mag]: AB magnitude of one count; None = unknown
-    background: Background that is subtracted, or None
+    background: what is subtracted, or None
     saturation [counts]: of the plane's pixels, before the background is subtracted; None = unknown
     band: of which this is an exposure, see Observation; None = its own, `name`
     """
@@ -70,7 +70,7 @@ class Channel:
     mask: Plane | None = None
     mask_value: int | None = None
     zero_point: float | None = None
-    background: Background | None = None
+    background: Background | ConstantBackground | None = None
     saturation: float | None = None
     band: str | None = None
 
@@ -100,6 +100,10 @@ class Channel:
         if self.mask is not None:
             bad = bad | (self.masked(box) if masked is None else masked)
         return np.where(bad, 0.0, values)
+
+    def valid(self, box) -> np.ndarray:
+        """Pixels (Ny, Nx) of a Box that mask and weights, where there are any, do not exclude."""
+        return self.weights(box) > 0 if self.weight is not None else ~self.masked(box)
 
     def saturation_of(self, box) -> float:
         """Saturation level [counts] of the result of `read` on a Box; infinite where unknown.

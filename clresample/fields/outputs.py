@@ -26,6 +26,7 @@ from .execution.search_setup import read_search_setup
 from .hats import write_hats
 from .model_mosaics import file_name, write_mosaics
 from .models import write_models
+from .sky_level import subtracted_levels
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install pyarrow)"
 FILES = (
@@ -33,6 +34,7 @@ FILES = (
     "provenance.json",
 )
 MAX_NOTED = 8  # kinds of messages of fits that notes name
+NUMBER = r"(?<!\w)[-+]?\d[\w.+-]*"  # not those in names, such as of channels
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
     *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
     *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
@@ -99,10 +101,10 @@ def _noted_messages(job, fits) -> list[str]:
     kinds: Counter[str] = Counter()
     for text in fits["messages"].tolist():
         found = set()
-        for line in re.sub(r"[-+]?\d[\w.+-]*", "#", text).split(SEPARATOR):
+        for line in text.split(SEPARATOR):
             label, _, rest = line.partition(": ")
-            known = f"{label}: " if label in names else ""
-            found.add(known + re.split("[:(]", rest if known else line)[0].strip())
+            known, rest = (f"{label}: ", rest) if label in names else ("", line)
+            found.add(known + re.sub(NUMBER, "#", re.split("[:(]", rest)[0]).strip())
         kinds.update(found - {""})
     most = sorted(kinds.items(), key=lambda pair: (-pair[1], pair[0]))[:MAX_NOTED]
     return [f"{n} of {len(fits)} fits: {kind}; see fit_table.ecsv" for kind, n in most]
@@ -142,6 +144,7 @@ def _write_provenance(path, job, about, seconds, status):
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "run": json.loads((job.folder / "run.json").read_text()),
         "failed_tiles": job.plan.failed_tiles,
+        "sky_levels": subtracted_levels(job.mosaics),
         "fits": dict(status),
         "seconds": seconds,
         "inputs": {what: {"file": str(f), "sha256": _checksum(f)} for what, f in files.items()},

@@ -22,11 +22,11 @@ from .execution.folder import open_folder
 from .execution.rounds import fit_all_groups
 from .execution.search_setup import prepare_search, read_search_setup
 from .execution.searching import load_or_make_plan
-from .field_toml.estimates import without_sky
 from .hats import check_hats
 from .options import MIN_MEMORY, FieldOptions, RunProgress
 from .outputs import FieldOutputs, check_outputs, write_outputs
 from .reference import reference_grid as reference_grid
+from .sky_level import measured_sky, sky_notes, without_sky
 from .strips import STRIPS
 
 
@@ -77,7 +77,9 @@ def run_field(
     whole, clock = Box.of(reference.shape), _Clock(seconds)
     settings, notes = options.settings, list[str]()
     if settings.fit_sky == AUTO:
-        mosaics = tuple(without_sky(m, notes) for m in mosaics)
+        found = measured_sky(mosaics, work)
+        notes = sky_notes(mosaics, found)
+        mosaics = without_sky(mosaics, {name: level for name, (level, _) in found.items()})
         settings = replace(settings, fit_sky=SMALL if notes else AUTO)
     core = whole if options.part is None else field_part(whole, *options.part)
     region = core if options.part is None else core.grown(options.margin_px).intersection(whole)

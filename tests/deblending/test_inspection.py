@@ -161,6 +161,18 @@ def test_wings_are_no_sky():
     assert inspected([o], source, fit_sky="small").messages == [message]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_smooth_noise_and_integers_scatter_as_their_weights_say(seed):
+    from scipy.ndimage import gaussian_filter
+
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=(2, *SHAPE)), (0, 1, 1))
+    data = image_of(noise=0) + NOISE * noise / noise.std()
+    assert inspected([observed(data, noise="estimate")]).messages == []
+    data = np.rint(image_of(noise=0.5, seed=seed))
+    weights = 1 / (0.5**2 + 1 / 12)
+    assert inspected([observed(data, weights=weights)]).messages == []
+
+
 @pytest.mark.parametrize("width, declared", [(0.0, None), (0.6, None), (0.6, "estimate")])
 def test_correlated_noise_is_named_unless_it_is_declared(width, declared):
     from scipy.ndimage import gaussian_filter

@@ -50,6 +50,17 @@ def test_source_and_neighbours_are_the_model_of_the_run(field, done, name):
         assert np.nanmin(added) >= 0
 
 
+def test_a_sky_that_the_run_subtracted_is_not_in_cutouts(field, done, sky, tmp_path):
+    folder, channel = tmp_path / "out", field.mosaics[1].channels[0].name
+    shutil.copytree(done[0], folder)
+    about = json.loads((folder / "provenance.json").read_text())
+    assert about["sky_levels"] == {}
+    (folder / "provenance.json").write_text(json.dumps(about | {"sky_levels": {channel: 7.0}}))
+    lower = FieldCutouts(folder, mosaics_of(sky)).cutout(int(field.ids[1]), channel)
+    data = field.cutout(int(field.ids[1]), channel).data
+    np.testing.assert_allclose(lower.data, data - 7.0, atol=1e-4)
+
+
 def test_names_sizes_groups_and_units(field):
     one = int(field.ids[1])
     channel = field.mosaics[1].channels[0].name

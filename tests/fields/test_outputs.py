@@ -43,18 +43,18 @@ def test_every_column_has_its_unit_and_a_description(done):
 
 
 def test_messages_of_fits_are_counted_by_their_kind():
-    job = SimpleNamespace(mosaics=[SimpleNamespace(name="A")])
+    job = SimpleNamespace(mosaics=[SimpleNamespace(name="acs_f814w")])
     texts = [
-        "A: sky is left in: g +0.3 sigma | light in B lies at (1, 2)",
+        "acs_f814w: sky is left in: g +0.3 sigma | light in B2 lies at (1, 2)",
         "",
-        "A: sky is left in: r",
+        "acs_f814w: sky is left in: r",
     ]
     fits = QTable(
-        {"messages": [*texts, "light in B lies at (3, 4) | light in B lies at (5, -1e3)"]}
+        {"messages": [*texts, "light in B2 lies at (3, 4) | light in B2 lies at (5, -1e3)"]}
     )
     assert _noted_messages(job, fits) == [
-        "2 of 4 fits: A: sky is left in; see fit_table.ecsv",
-        "2 of 4 fits: light in B lies at; see fit_table.ecsv",
+        "2 of 4 fits: acs_f814w: sky is left in; see fit_table.ecsv",
+        "2 of 4 fits: light in B2 lies at; see fit_table.ecsv",
     ]
 
 

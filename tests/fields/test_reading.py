@@ -9,12 +9,18 @@ from astropy.io import fits
 
 from clresample import PSF, Grid
 from clresample.cli import main
-from clresample.fields.background import find_background, find_sky
-from clresample.fields.field_toml.estimates import without_sky
+from clresample.fields.background import find_background
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.field_toml.headers import mask_value, zero_point
 from clresample.fields.field_toml.keys import parse_field
 from clresample.fields.mosaic import Mosaic
+from clresample.fields.sky_level import (
+    find_sky,
+    measured_sky,
+    sky_notes,
+    subtracted_levels,
+    without_sky,
+)
 from clresample.files.scene_keys import SceneError
 from clresample.sky.box import Box
 
@@ -89,33 +95,81 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
 
 
 @pytest.mark.parametrize("level", [0.3, -0.2, 0.03])
-def test_a_sky_that_was_left_in_is_measured(level):
+def test_a_sky_that_was_left_in_is_measured_once_and_subtracted(tmp_path, level):
     """That of the darkest cells; not of an image of so few that a galaxy may fill it."""
-    rng, notes = np.random.default_rng(2), []
-    image = rng.normal(2 * level, 2, (640, 640)).astype(np.float32)
+    image = np.random.default_rng(2).normal(2 * level, 2, (640, 640)).astype(np.float32)
     y, x = np.indices(image.shape)
     image += 500 * np.exp(-np.hypot(y - 100, x - 260) / 30)
-    sky, part = find_sky(*_readers(image), image.shape)
-    assert (sky is None) == (level == 0.03)
-    assert find_sky(*_readers(image[:320]), (320, 640)) == (None, 0.0)
-    mosaic = Mosaic.of_arrays(
-        "A",
-        image[None],
-        Grid.flat(image.shape, 0.1),
-        PSF.gaussian(2.0),
-        channels=["r"],
-        weights=0.25,
-    )
-    (channel,) = without_sky(mosaic, notes).channels
-    if sky is None:
-        assert channel is mosaic.channels[0] and not notes
+    assert find_sky(*_readers(image[:320]), (320, 640)) is None
+
+    def mosaic(data):
+        grid, psf = Grid.flat(image.shape, 0.1), PSF.gaussian(2.0)
+        return Mosaic.of_arrays("A", data[None], grid, psf, channels=["r"], weights=0.25)
+
+    found = measured_sky([mosaic(image)], tmp_path)
+    assert measured_sky([mosaic(image + 9)], tmp_path) == found  # of the first start
+    assert ("r" in found) == (level != 0.03)
+    (plain,), levels = mosaic(image).channels, {name: pair[0] for name, pair in found.items()}
+    (lowered,) = without_sky([mosaic(image)], levels)
+    (channel,) = lowered.channels
+    assert subtracted_levels([lowered]) == levels
+    if not found:
+        assert channel.background is None and not sky_notes([lowered], found)
         return
-    assert part == pytest.approx(level, abs=0.05)
+    counts, part = found["r"]
+    assert part == pytest.approx(level, abs=0.05) and counts == pytest.approx(2 * part, rel=0.02)
     box = Box(5, 7, 9, 12)
-    np.testing.assert_allclose(sky.read(box), 2 * part, rtol=0.02)
-    np.testing.assert_array_equal(channel.read(box), image[box.slices] - sky.read(box))
-    (note,) = notes
+    np.testing.assert_array_equal(channel.read(box), plain.read(box) - counts)
+    (note,) = sky_notes([lowered], found)
     assert f"r {part:+.2f}" in note and "fit_sky=False" in note
+
+
+def _noise(shape=(1024, 1024)):
+    return np.random.default_rng(4).normal(0, 1, shape).astype(np.float32)
+
+
+def _with_bowl(image):
+    image[:400, :400] -= 0.3
+    return image
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        _with_bowl(_noise()),
+        _noise() + np.linspace(-0.5, 0.5, 1024, dtype=np.float32),
+        _noise() + 50 * np.exp(-np.hypot(*np.indices((1024, 1024)) - 512.0) / 120),
+    ],
+    ids=["a bowl", "a gradient", "a galaxy"],
+)
+def test_what_is_not_the_same_everywhere_is_no_level_of_the_sky(image):
+    assert find_sky(*_readers(image), image.shape) is None
+
+
+def test_a_level_is_not_that_of_the_border_or_of_few_pixels():
+    shape = (128 * 40, 128 * 40)
+
+    def read(box):
+        y, x = np.ogrid[box.y0 : box.y1, box.x0 : box.x1]
+        edge = np.minimum(np.minimum(y, shape[0] - 1 - y), np.minimum(x, shape[1] - 1 - x)) < 128
+        return np.random.default_rng(box.y0 * shape[1] + box.x0).normal(0, 1, box.shape) - edge
+
+    assert find_sky(read, lambda box: np.ones(box.shape, bool), shape) is None
+
+    def few(box):
+        return np.random.default_rng(box.y0).uniform(size=box.shape) < 0.003
+
+    assert find_sky(lambda box: read(box) + 1, few, shape) is None
+
+
+def test_the_level_of_a_narrow_mosaic_with_a_masked_end_is_found():
+    image = _noise((160, 128 * 40)) + 0.4
+    found = find_sky(lambda box: image[box.slices], lambda box: _right_of(box, 300), image.shape)
+    assert found is not None and found[1] == pytest.approx(0.4, abs=0.03)
+
+
+def _right_of(box, column):
+    return np.broadcast_to(np.arange(box.x0, box.x1) >= column, box.shape)
 
 
 def _readers(image):

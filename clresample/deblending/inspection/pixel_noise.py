@@ -38,7 +38,7 @@ def noise_lines(image, sky) -> list[str]:
     local = values - sky.blocks.on_pixels(smooth, values.shape)
     for c in np.flatnonzero(many):
         correlation[c] = _correlation(values[c], pixels[c])
-        scatter[c] = SIGMAS_A_MAD * np.median(np.abs(local[c][pixels[c]]))
+        scatter[c] = np.hypot(_scatter(local[c][pixels[c]]), sky.block_scatter[c] / sky.blocks.side)
     lines = []
     correlated = (correlation > MIN_CORRELATION) & (sky.block_scatter > MIN_BLOCK_SCATTER)
     if o.noise is None and correlated.any():
@@ -57,6 +57,12 @@ def noise_lines(image, sky) -> list[str]:
             "square; scale weights or variance, unless faint sources fill the image"
         )
     return lines
+
+
+def _scatter(values):
+    """Standard deviation of values (n,) without outliers; also of integers, unlike by medians."""
+    away = np.abs(values)
+    return values[away < CLIP * max(SIGMAS_A_MAD * np.median(away), 1)].std()
 
 
 def _correlation(values, pixels):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from ...sky.box import Box
 from ...sky.correlation import NoiseCorrelation
 from ...sky.noise import noise_sigma
-from ..background import find_background, find_sky
+from ..background import find_background
 from ..mosaic import ConstantPlane
 
 # [px] Side of the region in a mosaic's middle from which its noise is estimated. A million pixels
@@ -15,38 +15,14 @@ from ..mosaic import ConstantPlane
 SAMPLE_PX = 1024
 
 
-def _good(channel):
-    """Returns a function that selects the valid pixels of a Box by a channel's mask and weights."""
-    only = channel if channel.weight is not None else replace(channel, weight=ConstantPlane(1.0))
-    return lambda box: only.weights(box) > 0
-
-
 def subtract_background(mosaic, table):
     """The mosaic with the background surfaces to subtract."""
     if table.get("background", "none") == "none":
         return mosaic
     channels = [
-        replace(c, background=find_background(c.data.read, _good(c), mosaic.grid.shape))
+        replace(c, background=find_background(c.data.read, c.valid, mosaic.grid.shape))
         for c in mosaic.channels
     ]
-    return replace(mosaic, channels=tuple(channels))
-
-
-def without_sky(mosaic, notes):
-    """The mosaic with the levels of its sky to subtract, where they are not zero."""
-    channels, found = [], []
-    for c in mosaic.channels:
-        if c.background is None:
-            sky, part = find_sky(c.data.read, _good(c), mosaic.grid.shape)
-            if sky is not None:
-                found.append(f"{c.name} {part:+.2f}")
-                c = replace(c, background=sky)
-        channels.append(c)
-    if found:
-        notes.append(
-            f"{mosaic.name}: the darkest cells of the sky are at {', '.join(found)} of a pixel's "
-            "noise, which is subtracted; with fit_sky=False it is not"
-        )
     return replace(mosaic, channels=tuple(channels))
 
 
@@ -63,7 +39,7 @@ def estimate_weights(mosaic, notes):
     for c in mosaic.channels:
         if c.weight is None:
             try:
-                sigma = noise_sigma(c.read(box), ~_good(c)(box))
+                sigma = noise_sigma(c.read(box), ~c.valid(box))
             except ValueError as error:
                 raise ValueError(
                     f"channel {c.name}: {error}; give weight, variance or rms"
