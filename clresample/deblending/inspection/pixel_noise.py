@@ -38,7 +38,9 @@ def noise_lines(image, sky) -> list[str]:
     local = values - sky.blocks.on_pixels(smooth, values.shape)
     for c in np.flatnonzero(many):
         correlation[c] = _correlation(values[c], pixels[c])
-        scatter[c] = np.hypot(_scatter(local[c][pixels[c]]), sky.block_scatter[c] / sky.blocks.side)
+        own = _scatter(local[c][pixels[c]])
+        # that of the blocks' means is of smooth noise, or of light that is brighter than the noise
+        scatter[c] = max(own, min(np.hypot(own, sky.block_scatter[c] / sky.blocks.side), 1))
     lines = []
     correlated = (correlation > MIN_CORRELATION) & (sky.block_scatter > MIN_BLOCK_SCATTER)
     if o.noise is None and correlated.any():
