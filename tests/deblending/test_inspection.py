@@ -270,6 +270,40 @@ def test_equal_pixels_around_a_brighter_one_are_no_flat_top():
     assert not spoilt.saturated(looked_at(observed(data))).any()
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.4, 1.0])
+def test_a_ray_across_a_source_is_masked_along_its_track(slope):
+    data, (y0, x0) = image_of(), DRAWN[0][0]
+    x = np.arange(int(x0) - 6, int(x0) + 7)
+    y = np.rint(y0 + slope * (x - x0)).astype(int)
+    data[0, y, x] += 60 * NOISE
+    found = inspected([observed(data)])
+    weights = found.blend.observations[0].weights
+    assert (weights[0, y, x] == 0).all() and (weights[1] > 0).all()
+    assert (weights[0] == 0).sum() <= 7 * len(x)
+    (message,) = found.messages
+    assert "cosmic rays" in message and "masked" in message
+
+
+def test_the_core_of_a_star_with_a_psf_too_wide_is_no_track():
+    o = observed(image_of(((DRAWN[0][0], (2e4, 2e4), 0.0),)))
+    wide = Observation(
+        o.data[:1],
+        PSF(o.psf.images[:1] @ gaussian_of(3.0, o.psf.images.shape[-1])),  # along x
+        o.grid,
+        weights=o.weights[:1],
+        channels=["g"],
+    )
+    found = inspected([wide], sources_of(DRAWN[:1], PointSource))
+    assert (found.blend.observations[0].weights > 0).all()
+    assert any("sharper than its PSF" in m for m in found.messages)
+
+
+def gaussian_of(sigma, n):
+    """Matrix (n, n) of a convolution with a Gaussian."""
+    away = np.arange(n) - np.arange(n)[:, None]
+    return np.exp(-(away**2) / (2 * sigma**2)) / (sigma * np.sqrt(2 * np.pi))
+
+
 def test_flat_tops_are_masked_as_saturated():
     data = image_of(((DRAWN[0][0], (9e4, 9e4), 0.0), *DRAWN[1:]))
     data[1] = np.minimum(data[1], 0.6 * data[1].max())

@@ -276,9 +276,10 @@ def _spoilt(image):
     sharp = spoilt.sharper_than_psf(image)
     if not sharp.any():
         return full, lines
-    on_source = sharp & _cores(image)
-    repeated = sharp & (sharp.sum(axis=0) > 1)
-    kept = on_source | repeated
+    repeated, cores = sharp & (sharp.sum(axis=0) > 1), _cores(image)
+    track = spoilt.tracks(sharp & ~repeated, cores)
+    on_source = sharp & cores & ~track
+    sharp, kept = sharp | track, (on_source | repeated) & ~track
     for c in np.flatnonzero(kept.any(axis=(1, 2))):
         y, x = np.argwhere(kept[c])[0]
         lines.append(

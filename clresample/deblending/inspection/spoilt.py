@@ -16,6 +16,9 @@ FLAT_PIXELS, FLAT_INTEGERS = 3, 5
 GROW_PX = 2
 # [sigma] Not reached by 1e6 pixels of noise.
 SHARP_SIGMAS = 6.0
+# Smallest number of pixels of a track, and the largest scatter of theirs across it [px]: a line of
+# pixels has 0.3, the rim of a star whose PSF is too wide 1 and more. [px] Largest gap in a track.
+TRACK_PIXELS, TRACK_WIDTH_PX, GAP_PX = 3, 0.6, 4
 # Uncertainty of a pixel in units of the brightest pixel nearby: PSFs are accurate to a few percent.
 NEIGHBOUR_PART = 0.05
 
@@ -53,6 +56,33 @@ def saturated_pixels(observation, significance, usable) -> np.ndarray:
 def grown(pixels) -> np.ndarray:
     """Pixels (C, My, Mx) bool and their eight neighbours, to which charge spreads."""
     return binary_dilation(pixels, np.ones((1, 3, 3), bool))
+
+
+def tracks(sharp, cores) -> np.ndarray:
+    """Those of sharp pixels (C, My, Mx) bool that lie on a line, with the pixels in its gaps.
+
+    Where a track crosses a source, pixels are less sharp. Nothing of the sky is a line of pixels
+    that are sharper than the PSF, but for the core of a star whose PSF is too wide: lines that end
+    in the cores (My, Mx) of sources are left out.
+    """
+    found = np.zeros_like(sharp)
+    for c in np.flatnonzero(sharp.sum(axis=(1, 2)) >= TRACK_PIXELS):
+        joined = binary_dilation(sharp[c], np.ones((3, 3), bool), iterations=GAP_PX // 2)
+        groups, n = label(joined, np.ones((3, 3), bool))
+        for k in range(1, n + 1):
+            pixels = np.argwhere(sharp[c] & (groups == k))
+            if len(pixels) < TRACK_PIXELS or cores[*pixels.T].all():
+                continue
+            middle = pixels.mean(axis=0)
+            _, axes = np.linalg.eigh(np.cov(pixels.T, bias=True))
+            across, along = ((pixels - middle) @ axes).T
+            if np.std(across) > TRACK_WIDTH_PX:
+                continue
+            steps = np.arange(along.min(), along.max() + 0.5, 0.5)
+            y, x = np.rint(middle + steps[:, None] * axes[:, 1]).astype(int).T
+            found[c, y, x] = True
+            found[c, *pixels.T] = True
+    return found
 
 
 def _flat_tops(data, bright):
