@@ -59,7 +59,7 @@ def find_background(read, good, shape) -> Background:
     than 32 valid pixels get the level of their neighbours. Then each level is replaced by the
     median of 3 x 3 cells, which removes cells dominated by a bright galaxy.
     """
-    edges = cell_edges(shape)
+    edges = cell_edges(shape, CELL_PX)
     counts = [len(part) - 1 for part in edges]
     levels = np.full(counts, np.nan)
     for i in range(counts[0]):
@@ -78,7 +78,7 @@ def find_background(read, good, shape) -> Background:
     return Background(levels, tuple(n / k for n, k in zip(shape, counts, strict=True)))
 
 
-def cell_edges(shape):
-    """Edges of cells along each axis of an image (Ny, Nx) [px]."""
-    counts = [max(1, round(n / CELL_PX)) for n in shape]
+def cell_edges(shape, side):
+    """Edges of cells of about `side` [px] along each axis of an image (Ny, Nx) [px]."""
+    counts = [max(1, round(n / side)) for n in shape]
     return [np.linspace(0, n, k + 1).astype(int) for n, k in zip(shape, counts, strict=True)]

@@ -13,34 +13,33 @@ from ..sky.noise import background
 from .background import ConstantBackground, cell_edges
 
 FILE = "sky_levels.json"  # in the folder of a run
-# Largest number of cells by which the level is measured, spread over an image, and the smallest
-# number: images of fewer cells may be full of one galaxy.
+# [px] Side of a cell, and the quantile of the cells' levels that is the sky's: the darkest have the
+# fewest sources. Errors are 0.00 to 0.02 of a pixel's noise in four fields of `simulate field --sky
+# real` and `bright`; with 128 px they are 0.01 to 0.06, as all cells have sources.
+CELL_PX, DARKEST = 64, 0.1
+# Largest number of cells that are measured, spread over an image, and the smallest number.
 MAX_CELLS, MIN_CELLS = 256, 16
-# Smallest part of a cell's pixels that must be valid: the error of its level is then 0.02 of a
-# pixel's noise.
+# Smallest part of a cell's pixels that must be valid; its level then has an error of 0.04 of their
+# noise.
 VALID_PART = 0.25
-# The level is the quantile DARKEST of the cells', as the darkest have the fewest sources.
-DARKEST = 0.1
-# Quantiles of the cells' levels that must agree, within MIN_LEVEL of a pixel's noise or ALIKE of
-# the level. They differ by up to 0.06 of the noise in `simulate field`; by 0.1 to 0.4, and 0.29 of
+# Quantiles of the cells' levels that must agree, within this part of a pixel's noise or of the
+# level. They differ by up to 0.05 of the noise in simulated fields; by 0.1 to 0.4, and by 0.29 of
 # the level, in images full of a galaxy, with a gradient, or with dark bowls about galaxies.
 AGREEING, ALIKE = (0.05, 0.25), 0.1
-# [1] of a pixel's noise: smaller levels are left, as faint sources alone have 0.06 in `simulate
-# field --sky real` without faults.
-MIN_LEVEL = 0.1
+# [1] of a pixel's noise: smaller levels are left.
+MIN_LEVEL = 0.05
 
 
 def find_sky(read, good, shape) -> tuple[float, float] | None:
-    """The level of an image's sky [counts], and in units of a pixel's noise.
+    """The level of an image's sky [counts], and in units of a pixel's noise; 0 within MIN_LEVEL.
 
-    None of a level within MIN_LEVEL, where the darkest cells disagree, and of an image of fewer
-    than MIN_CELLS valid cells. A level below zero must be that of most cells: sources make others
-    brighter only.
+    None where the darkest cells disagree, and of an image of fewer than MIN_CELLS valid cells. A
+    level below zero must be that of most cells: sources make others brighter only.
 
     read: called with a Box, returns its pixels; good: called with a Box, returns its valid pixels
     shape (Ny, Nx) [px]
     """
-    edges, found = cell_edges(shape), []
+    edges, found = cell_edges(shape, CELL_PX), []
     rows, columns = _spread_cells([len(part) - 1 for part in edges])
     for i in rows:
         for j in columns:
@@ -58,9 +57,11 @@ def find_sky(read, good, shape) -> tuple[float, float] | None:
     levels, sigma = levels[:, 0], float(np.median(levels[:, 1]))
     level, middle = np.quantile(levels, [DARKEST, 0.5])
     darker, brighter = np.quantile(levels, AGREEING)
-    least = MIN_LEVEL * sigma
-    agree = brighter - darker < max(least, ALIKE * abs(level))
-    if not agree or abs(level) <= least or (level < 0 and middle > -least / 2):
+    if brighter - darker > ALIKE * max(sigma, abs(level)):
+        return None
+    if abs(level) <= MIN_LEVEL * sigma:
+        return 0.0, 0.0
+    if level < 0 and middle > -MIN_LEVEL * sigma:
         return None
     return float(level), float(level) / sigma
 
@@ -74,10 +75,10 @@ def _spread_cells(counts):
 
 
 def measured_sky(mosaics, work) -> dict[str, tuple[float, float]]:
-    """{channel: (level [counts], in units of a pixel's noise)} of the skies that were left in.
+    """{channel: (level [counts], in units of a pixel's noise)} of the skies that `find_sky` finds.
 
     Measured in a run's first start, and read from its folder `work` later, so that all fits have
-    the same. Channels with a background have none.
+    the same. That of channels with a background is 0.
     """
     path = work / FILE
     if path.exists():
@@ -85,20 +86,21 @@ def measured_sky(mosaics, work) -> dict[str, tuple[float, float]]:
     found = {}
     for mosaic in mosaics:
         for c in mosaic.channels:
+            sky = 0.0, 0.0
             if c.background is None:
                 sky = find_sky(c.data.read, c.valid, mosaic.grid.shape)
-                if sky is not None:
-                    found[c.name] = sky
+            if sky is not None:
+                found[c.name] = sky
     with atomic_file(path) as part:
         part.write_text(json.dumps(found, indent=1))
     return found
 
 
 def without_sky(mosaics, levels) -> tuple:
-    """The mosaics with levels {channel: [counts]} to subtract."""
+    """The mosaics with levels {channel: [counts]} to subtract, where they are not 0."""
 
     def lowered(c):
-        known = c.background is None and c.name in levels
+        known = c.background is None and levels.get(c.name)
         return replace(c, background=ConstantBackground(levels[c.name])) if known else c
 
     return tuple(replace(m, channels=tuple(lowered(c) for c in m.channels)) for m in mosaics)
@@ -116,7 +118,8 @@ def sky_notes(mosaics, found) -> list[str]:
     """A line on each mosaic with a sky that was left in; found: by `measured_sky`."""
     notes = []
     for mosaic in mosaics:
-        parts = [f"{c.name} {found[c.name][1]:+.2f}" for c in mosaic.channels if c.name in found]
+        known = [(c.name, found[c.name][1]) for c in mosaic.channels if c.name in found]
+        parts = [f"{name} {part:+.2f}" for name, part in known if part]
         if parts:
             notes.append(
                 f"{mosaic.name}: the darkest cells of the sky are at {', '.join(parts)} of a "

@@ -25,7 +25,7 @@ weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -36,8 +36,10 @@ from .hills import root, saddles, watershed
 BODY_AREA = 100.0
 # [FWHM^2] The same for small galaxies, whose knots cannot be told from fainter neighbours; and part
 # of the galaxy's peak up to which they are in its group. Of rows of `simulate field --sky bright`,
-# seeds 2 and 3, that are neither in a group nor true sources, 22 are left of 82.
-SMALL_AREA, TWIN = 20.0, 0.5
+# seeds 2 and 3, that are neither in a group nor true sources, 22 are left of 82. Brighter peaks are
+# in it up to this contrast: ten of 19 such are sources of their own in `simulate field --sky real`,
+# seeds 1 to 6, and 11 of 16 of a higher contrast.
+SMALL_AREA, TWIN, TWIN_CONTRAST = 20.0, 0.5, 1.0
 # [thresholds] Level of a body from which its peaks can be structure. Little of a fainter body is
 # above the noise, so that each of its peaks stays a source.
 BRIGHT = 8.0
@@ -119,12 +121,13 @@ class Bodies:
     """The bodies of an image, and the relation of its peaks to them.
 
     owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are not
-        sources
+        sources; contrast (S,): of the peaks
     """
 
     bodies: tuple[Body, ...] = ()
     owners: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    contrast: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def body_at(self, position) -> int:
         """Number of the bright body whose outline contains a position (2,) [px], -1 for none."""
@@ -145,16 +148,18 @@ class Bodies:
 def small_bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
     """The Bodies of small galaxies, down to SMALL_AREA; their peaks stay sources, in groups.
 
-    Peaks over TWIN of the galaxy's own one are in no group. Arguments are those of `bodies_of`.
+    Peaks over TWIN of the galaxy's own one and over TWIN_CONTRAST are in no group. Arguments are
+    those of `bodies_of`.
     """
     found = bodies_of(image, places, fwhm_px, threshold, scale, least=SMALL_AREA)
     tops = np.array([image[tuple(np.rint(b.center).astype(int))] for b in found.bodies])
     at = np.rint(np.asarray(places).reshape(-1, 2)).astype(int)
     own = found.owners >= 0
     heights, limits = image[at[own, 0], at[own, 1]], tops[found.owners[own]]
+    is_twin = (heights > TWIN * limits) & (heights < limits)
     owners = found.owners.copy()
-    owners[own] = np.where((heights > TWIN * limits) & (heights < limits), -1, owners[own])
-    return Bodies(found.bodies, owners, found.structure)
+    owners[own] = np.where(is_twin & (found.contrast[own] > TWIN_CONTRAST), -1, owners[own])
+    return replace(found, owners=owners)
 
 
 def bodies_of(image, places, fwhm_px, threshold, scale, *, least=BODY_AREA) -> Bodies:
@@ -168,7 +173,7 @@ def bodies_of(image, places, fwhm_px, threshold, scale, *, least=BODY_AREA) -> B
     at = np.rint(np.asarray(places).reshape(-1, 2)).astype(int)
     n, area = len(at), int(least * fwhm_px**2)
     if not n or np.count_nonzero(image > threshold) < area:
-        return Bodies((), np.full(n, -1), np.zeros(n, bool))
+        return Bodies((), np.full(n, -1), np.zeros(n, bool), np.zeros(n))
     inside = image > threshold
     inside[at[:, 0], at[:, 1]] = True
     basins = watershed(image, inside, at)
@@ -215,7 +220,8 @@ def bodies_of(image, places, fwhm_px, threshold, scale, *, least=BODY_AREA) -> B
         if found[owner].distance(at[i]) < 1:
             is_member = found[owner].takes(heights[i], max(base[i], threshold))[1]
             owners[i] = owner if is_member else -1
-    return Bodies(tuple(found), owners, structure)
+    contrast = heights / np.maximum(base, threshold) - 1
+    return Bodies(tuple(found), owners, structure, contrast)
 
 
 def _owner(bodies, parts, position) -> int:

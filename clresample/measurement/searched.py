@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from .clumps import Bodies, bodies_of, small_bodies_of
@@ -80,7 +82,8 @@ class Search:
         small = small_bodies_of(image, np.array(self.positions)[free], *given)
         owners = large.owners.copy()
         owners[free] = np.where(small.owners < 0, -1, small.owners + len(large.bodies))
-        self.bodies = Bodies((*large.bodies, *small.bodies), owners, large.structure)
+        bodies = (*large.bodies, *small.bodies)
+        self.bodies = replace(large, bodies=bodies, owners=owners)
 
     def add_companions(self, new, image, label):
         """Adds peaks beside others: positions and heights of an image's residual there."""
