@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.solver.multiscale import inverse
+from clresample.deblending.solver.multiscale import inverse, scale_direction
 from clresample.deblending.solver.multiscale.evidence import (
     LocalPowerSpectra,
     SourceEvidence,
@@ -11,6 +11,7 @@ from clresample.deblending.solver.multiscale.evidence import (
 )
 from clresample.deblending.solver.multiscale.inverse import BlockPreconditioner, CurvatureBlock
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.scale_direction import coefficients_of
 
 SPECTRUM = np.array([3.0, 1.0])
 
@@ -311,3 +312,14 @@ def test_a_matrix_that_float32_cannot_factor_is_factored_in_float64():
     curvature = np.full((2, 2), 2.0**30, np.float32)
     block = CurvatureBlock(0, np.arange(2), inverse._root(curvature, np.full(2, 0.5)))
     np.testing.assert_allclose(whole(block), [[1, -1], [-1, 1]], rtol=1e-5)
+
+
+def test_matrices_and_transforms_give_the_same_coefficients(monkeypatch):
+    prior, profile = MultiscalePrior(), galaxy(31, 44).astype(np.float32)
+    window, strengths = (slice(3, 29), slice(5, 44)), np.array(prior.strengths)
+    wanted = profile[window] * np.float32(0.5)
+    by_matrices = coefficients_of(prior, profile, wanted, strengths, window)[1]
+    monkeypatch.setattr(scale_direction, "MAX_MATRIX_SIDE", 0)
+    by_transforms = coefficients_of(prior, profile, wanted, strengths, window)[1]
+    assert np.abs(by_matrices - by_transforms).max() < 1e-4 * np.abs(by_transforms).max()
+    assert np.abs(by_matrices - wanted).max() < 0.1 * wanted.max()

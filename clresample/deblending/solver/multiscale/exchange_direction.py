@@ -86,14 +86,16 @@ def _direction(scene, state, boxes, pair, evidence, strengths):
     def curvature_with(falls):
         total = by_prior
         for which, left in ((falls, change - fraction * light), (~falls, change)):
-            sharpness = evidence.sharpness(np.where(which, spectrum, 0))
-            total += max(seen_through(sharpness, left[None], 1)[0] @ left.ravel(), 0)
+            if spectrum[which].any():
+                sharpness = evidence.sharpness(np.where(which, spectrum, 0))
+                total += max(seen_through(sharpness, left[None], 1)[0] @ left.ravel(), 0)
         return total
 
-    falls = state.spectra[j] > 0
-    least_left = MIN_STEPS * fraction * spectrum / np.sqrt(curvature_with(falls))
-    falls &= state.spectra[j] > least_left
-    curvature = curvature_with(falls)
+    shines = state.spectra[j] > 0
+    curvature = curvature_with(shines)
+    falls = shines & (state.spectra[j] > MIN_STEPS * fraction * spectrum / np.sqrt(curvature))
+    if (falls != shines).any():
+        curvature = curvature_with(falls)
     if not falls.any() or curvature > MAX_CURVATURE * alone:
         return None
     spectra = np.zeros_like(state.spectra)

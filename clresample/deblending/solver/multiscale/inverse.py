@@ -41,8 +41,8 @@ MAX_BLOCK_SIZE = 512
 # and memory.
 COARSEST, MAX_PIXELS = 2, 3000
 # Number of binned pixels from which T is applied by transforms, which at 2000 pixels take a third
-# of the time of a matrix product; below it the matrix is faster. Then the number of images that are
-# transformed at a time.
+# of the time of a matrix product; below it the matrix is faster, unless it is for a single image.
+# Then the number of images that are transformed at a time.
 MANY_PIXELS, TOGETHER = 1200, 32
 # A block uses the pixels where one of its coefficients has more than this fraction of its largest
 # value. It is recomputed if the logarithm of a strength, or the spectrum relative to its largest
@@ -203,7 +203,7 @@ def _binned(values, axis, step):
 def seen_through(sharpness, images, step):
     """T (n, n) times images (m, ny, nx), of n pixels, as rows (m, n); see `_between`."""
     shape = images.shape[1:]
-    if shape[0] * shape[1] < MANY_PIXELS:
+    if shape[0] * shape[1] < MANY_PIXELS and len(images) > 1:
         return images.reshape(len(images), -1) @ _between(sharpness, shape, step)
     from scipy import fft  # takes 0.05 s, not needed by small galaxies
 

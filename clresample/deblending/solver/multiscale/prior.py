@@ -86,3 +86,13 @@ def kernel_rows(prior, j, n):
     lag = np.arange(n) - at[:, None] + len(taps) // 2
     inside = (lag >= 0) & (lag < len(taps))
     return (np.sqrt(step) * np.where(inside, taps[np.where(inside, lag, 0)], 0)).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=128)
+def correlations(prior, n):
+    """K_j K_j^T of each scale along a side of `n` pixels (J, n, n), of kernels on every pixel."""
+    lag = np.abs(np.arange(n)[:, None] - np.arange(n))
+    rows = np.zeros((len(prior.scales_px), max(n, 2 * max(prior.radii) + 1)))
+    for row, taps in zip(rows, prior.kernels(), strict=True):
+        row[: len(taps)] = np.correlate(taps, taps, "full")[len(taps) - 1 :]
+    return rows[:, lag].astype(np.float32)
