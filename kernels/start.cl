@@ -18,7 +18,7 @@
  * whiten   images <- images root;  launch: (X, tallest window, slots)
  * compute_residuals  model m = sky root + sum_slots A images, residual r = data root - m, weight
  *          w = 1 / (1 + (error (light - sky root))^2) where root is not 0, error (B, n_bands);
- *          sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
+ *          sums (B, n_bands, 3, my): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
@@ -128,9 +128,10 @@ void compute_residuals(__global const int *restrict scenes, __global const int *
     const REAL a = group_sum(SUM8(chi2), lid, share), e = group_sum(SUM8(by_sky), lid, share);
     const REAL o = group_sum(SUM8(of_sky), lid, share);
     if (lid == 0) {
-        sums[3 * line] = a;
-        sums[3 * line + 1] = e;
-        sums[3 * line + 2] = o;
+        __global REAL *sum = sums + 3 * (line - y) + y;
+        sum[0] = a;
+        sum[my] = e;
+        sum[2 * my] = o;
     }
 }
 

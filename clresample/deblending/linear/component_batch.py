@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +50,7 @@ def renumbered(components) -> list[StartComponent]:
 
 
 def boxes_of(components, thetas, thresholds):
-    """Origins and sizes [(2,), (2,)] of boxes that hold components down to a part of their peaks.
+    """Origins and sizes (n, 2, 2) of boxes that hold components down to a part of their peaks.
 
     They have one of the BOX_SIDES, or the frame's, and lie inside the frame.
     """
@@ -59,13 +58,11 @@ def boxes_of(components, thetas, thresholds):
     if smooth.any():
         theta, moment = _stacked(components, thetas, smooth)
         half[smooth] = galaxy_reach(theta, moment, thresholds[smooth])
-    boxes = []
-    for i, c in enumerate(components):
-        middle = c.position
-        if not smooth[i]:
-            middle, half[i] = c.shape.bounding_box(thetas[i], c.position, thresholds[i])
-        boxes.append(_box_about(middle, half[i], c.frame))
-    return boxes
+    middle = np.array([c.position for c in components], float).reshape(-1, 2)
+    for i in np.flatnonzero(~smooth):
+        c = components[i]
+        middle[i], half[i] = c.shape.bounding_box(thetas[i], c.position, thresholds[i])
+    return _boxes_about(middle, half, np.array([c.frame for c in components]).reshape(-1, 2))
 
 
 def peaks_of(components, thetas):
@@ -91,19 +88,18 @@ def _stacked(components, thetas, at):
     return np.array([thetas[i] for i in at]), moment
 
 
-def _box_about(middle, half, frame):
-    """Origin and size of a box of one of the BOX_SIDES inside the frame.
+def _boxes_about(middle, half, frame):
+    """Origins and sizes (n, 2, 2) of boxes with one of the BOX_SIDES inside frames.
 
-    Middle, half, frame (2,).
+    Middle, half, frame (n, 2).
     """
-    need = 2 * min(float(max(half)), float(max(frame))) + 1
-    side = next((s for s in BOX_SIDES if s >= need), None)
-    if side is None:
-        side = BOX_SIDES[-1] * 2 ** math.ceil(math.log2(need / BOX_SIDES[-1]))
-    size = [min(side, n) for n in frame]
-    low = [math.floor(p + 0.5) - n // 2 for p, n in zip(middle, size, strict=True)]
-    low = [min(max(p, 0), n - m) for p, n, m in zip(low, frame, size, strict=True)]
-    return low, size
+    need, largest = 2 * np.minimum(half.max(axis=1), frame.max(axis=1)) + 1, BOX_SIDES[-1]
+    side = np.array(BOX_SIDES)[np.searchsorted(BOX_SIDES[:-1], need)]
+    doubled = largest * 2 ** np.ceil(np.log2(np.maximum(need / largest, 1)))
+    side = np.where(need > largest, doubled, side).astype(int)
+    size = np.minimum(side[:, None], frame)
+    low = np.floor(middle + 0.5).astype(int) - size // 2
+    return np.stack([np.clip(low, 0, frame - size), size], axis=1)
 
 
 def profile_thresholds(brightness):
@@ -117,8 +113,8 @@ def profile_thresholds(brightness):
 class ComponentBatch:
     """Components drawn side by side; those of equal boxes and scenes follow each other.
 
-    components (n): any; thetas (n): their parameters; boxes (n): (origin, size); slopes: True to
-        draw slopes with the profiles, or bool (n,) for each
+    components (n): any; thetas (n): their parameters; boxes (n, 2, 2): origins and sizes
+    slopes: True to draw slopes with the profiles, or bool (n,) for each
 
     order (n,): the components in the order of the slots; scene, n_images (n,), origin, size (n, 2),
     begin (n,): first element of each slot's images in the device array that `draw` returns
@@ -126,7 +122,7 @@ class ComponentBatch:
 
     def __init__(self, components, thetas, boxes, *, slopes):
         scene = np.array([c.scene for c in components])
-        origin, size = (np.array([box[k] for box in boxes]).reshape(-1, 2) for k in (0, 1))
+        origin, size = np.reshape(boxes, (-1, 2, 2)).swapaxes(0, 1)
         count = 1 + slopes * np.array([len(theta) for theta in thetas])
         self.order = order = np.lexsort((scene, count, size[:, 1], size[:, 0]))
         self.components = [components[i] for i in order]

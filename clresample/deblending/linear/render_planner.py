@@ -96,14 +96,17 @@ class RenderPlanner:
     def _about(self, slots, first, last):
         """Renderer and offsets of slots whose plans are those of all boxes of their shape."""
         scene, origin = slots.scene[first:last], slots.origin[first:last]
-        shape, used = tuple(slots.size[first].tolist()), np.unique(self._plan[scene])
+        shape, plan = tuple(slots.size[first].tolist()), self._plan[scene]
         key = int(self._layout[scene[0]]), shape
-        windows = self._renderers.get(key)
-        if windows is None or not np.isin(used, windows.members).all():
-            members = used if windows is None else np.union1d(used, windows.members)
+        windows, used = self._renderers.get(key), set(plan.tolist())
+        if windows is None or not used <= windows.known:
+            members = np.array(sorted(used if windows is None else used | windows.known))
             windows = self._renderers[key] = self._windows(key[0], members, shape)
-        which = np.searchsorted(windows.members, self._plan[scene])
-        placed = np.array([self.views[s].mapping.offset + self.views[s].op.shift for s in scene])
+        which = np.searchsorted(windows.members, plan)
+        own = {
+            s: self.views[s].mapping.offset + self.views[s].op.shift for s in set(scene.tolist())
+        }
+        placed = np.array([own[s] for s in scene.tolist()])
         off = placed - origin - windows.offset[which]
         low, moves = place_windows(off, windows.matrix[which])
         lit = np.concatenate([low, windows.own[which]], axis=1)
@@ -179,13 +182,15 @@ class RenderPlanner:
 class _WindowRenderer:
     """Renders boxes of one shape about their middle.
 
-    members (P,): the plans of whole frames that they are windows of, ascending; renderer: of them
+    members (P,): the plans of whole frames that they are windows of, ascending, `known` as a set
+    renderer: of them
     offset, matrix: of mappings (P, 2), (P, 2, 2) that begin where the light does
     own (P, 2): pixels that each one's light reaches; before (P, 2): those in front of these
     """
 
     def __init__(self, members, renderer, own):
         self.members, self.renderer, self.own = members, renderer, own
+        self.known = set(members.tolist())
         mappings = [plan.mapping for plan in renderer.plans]
         self.offset = np.array([m.offset for m in mappings])
         self.matrix = np.array([m.matrix for m in mappings])

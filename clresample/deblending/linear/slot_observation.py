@@ -55,7 +55,8 @@ class SlotObservation:
         self.residual, self.weight = (
             self.device.empty(self.root.shape, self.dtype) for _ in range(2)
         )
-        self.sums = self.device.empty((*self.root.shape[:3], 3), self.dtype)
+        b, c, my = self.root.shape[:3]
+        self.sums = self.device.empty((b, c, 3, my), self.dtype)
 
     def cut(self, scenes, low, size) -> SlotObservation:
         """Windows of scenes (k,), which may repeat, as scenes of their own.
@@ -169,7 +170,7 @@ class SlotObservation:
             weight=self.weight,
             sums=self.sums,
         )
-        return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
+        return self.device.get(self.sums)[scenes].sum(axis=-1, dtype=np.float64)
 
     def without_light(self, scenes, slots, spectra) -> SlotObservation:
         """This observation without the slots' light in the data of scenes (k,).
@@ -244,12 +245,12 @@ def _pairs(scenes, lit, shape):
     """Overlapping pairs of slots of `scenes` (n,), `lit` (n, 4) on an observation of this shape."""
     low = np.maximum(lit[:, :2], 0)
     high = np.minimum(lit[:, :2] + lit[:, 2:], shape)
-    found = []
-    for scene in np.unique(scenes):
-        at = np.flatnonzero(scenes == scene)
-        both = np.maximum(low[at, None], low[at]), np.minimum(high[at, None], high[at])
-        meet = np.triu((both[1] > both[0]).all(axis=2))
-        i, j = np.nonzero(meet)
-        start = both[0][i, j]
-        found.append(np.column_stack([at[i], at[j], start, both[1][i, j] - start]))
-    return np.concatenate(found)
+    at = np.argsort(scenes, kind="stable")
+    # of each slot the later ones of its scene, from itself on
+    count = np.searchsorted(scenes[at], scenes[at], "right") - np.arange(len(at))
+    first = np.repeat(np.arange(len(at)), count)
+    later = np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
+    i, j = at[first], at[first + later]
+    start, end = np.maximum(low[i], low[j]), np.minimum(high[i], high[j])
+    meet = (end > start).all(axis=1)
+    return np.column_stack([i, j, start, end - start])[meet]
