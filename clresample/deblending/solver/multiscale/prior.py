@@ -78,7 +78,7 @@ def without_profile(image, profile):
     return image - profile * ((profile * image).sum() / max(np.square(profile).sum(), 1e-30))
 
 
-@functools.lru_cache(maxsize=32)
+@functools.lru_cache(maxsize=128)
 def kernel_rows(prior, j, n):
     """K_j of each coefficient along a side of `n` pixels (n_j, n)."""
     step, taps = prior.steps[j], prior.kernels()[j]
