@@ -86,9 +86,8 @@ def measured_sky(mosaics, work) -> dict[str, tuple[float, float]]:
     found = {}
     for mosaic in mosaics:
         for c in mosaic.channels:
-            sky = 0.0, 0.0
-            if c.background is None:
-                sky = find_sky(c.data.read, c.valid, mosaic.grid.shape)
+            bare = c.background is None
+            sky = find_sky(c.data.read, c.valid, mosaic.grid.shape) if bare else (0.0, 0.0)
             if sky is not None:
                 found[c.name] = sky
     with atomic_file(path) as part:

@@ -131,8 +131,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     if moved is not None:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move, fit_sky=fit_sky)
-    levels = [pair[fit_sky] for pair in levels]
-    return Inspection(blend, settings, shifts, messages + lines, levels)
+    of_fit = [pair[fit_sky] for pair in levels]
+    return Inspection(blend, settings, shifts, messages + lines, of_fit)
 
 
 def _doubles(sources, positions):
