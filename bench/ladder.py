@@ -6,7 +6,8 @@ case        single, of Sersic n = 1, 2.5, 4; neighbour: the same with one of sig
             1, 2.5 or 4 r_e and 4 px; pair of equals at 0.5 to 3 r_e; bulge_disk of other colours;
             giant with eight satellites; cosmos: real galaxies drawn 4 and 8 times as large;
             star_as_galaxy, a star fitted as ExtendedSource; galaxy_as_point, the reverse;
-            close: two galaxies of similar size and brightness, 0.5 to 2 px apart
+            close: two galaxies of similar size and brightness, 0.5 to 2 px apart; ray: a galaxy
+            with a cosmic ray across its core, in one channel
 mode        one: a survey of three bands, Moffat PSF 4.2 px wide; joint: Euclid and Rubin
 
 Frames are 8 r_e wide, or 65 px, or as their sources need. Positions are the true ones. The truth of
@@ -48,10 +49,11 @@ from .harness.options import BadOption, Parser, run
 N_SCENES = {
     "single": 150, "neighbour": 40, "pair": 40, "bulge_disk": 30, "giant": 10, "cosmos": 24,
     "star_as_galaxy": 30, "galaxy_as_point": 30, "close": 40,
+    "ray": 60,
 }  # fmt: skip
 N_QUICK = {
     "single": 12, "neighbour": 5, "pair": 4, "bulge_disk": 2, "giant": 1, "cosmos": 2,
-    "star_as_galaxy": 2, "galaxy_as_point": 2, "close": 2,
+    "star_as_galaxy": 2, "galaxy_as_point": 2, "close": 2, "ray": 2,
 }  # fmt: skip
 QUICK_RE_PX = 16.0  # [px] r_e of --quick, at most: larger frames take most of the time
 FIRST_SEED = 1

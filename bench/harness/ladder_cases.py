@@ -6,6 +6,7 @@ that of the best possible filter for the whole galaxy, in all bands of all instr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,9 +14,11 @@ import numpy as np
 from clresample import ExtendedSource, PointSource
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 from clresample.simulation.scenes import POWER_LAW_INDEX
+from clresample.simulation.spoilers import COSMIC_PX, COSMIC_SIGMA
 
 from .ladder_scenes import MODES, Item, Part, instruments, make_scene
 from .options import data_folder
+from .spoilt_scenes import changed
 
 SERSIC_N = (1.0, 2.5, 4.0)
 RE_PX, SNR, AXIS_RATIO = (2.0, 64.0), (10.0, 3e4), (0.2, 1.0)
@@ -35,6 +38,7 @@ N_COSMOS = 12  # galaxies of highest signal to noise, of which one is drawn
 WRONG_KIND_RE_PX = (2.0, 8.0)
 CLOSE_RE_PX, CLOSE_SNR, CLOSE_AWAY_PX = (1.5, 12.0), (30.0, 3e3), (0.5, 2.0)
 CLOSE_RATIOS = (0.7, 1.4)  # of the two sizes, and of the two S/N
+RAY_RE_PX, RAY_SNR, RAY_AWAY_PX = (1.5, 8.0), (15.0, 500.0), 1.5  # scatter of the track's middle
 
 
 class Limits:
@@ -180,11 +184,32 @@ def close(rng, scale, limits):
     ]
 
 
+def ray(rng, scale, limits):
+    re_px, snr = limits.size(rng, *RAY_RE_PX), limits.brightness(rng, *RAY_SNR)
+    return [galaxy(rng, scale, limits.steepness(rng), re_px, snr)]
+
+
+def with_ray(scene, rng):
+    """The scene with a cosmic ray across its middle in one channel of one observation."""
+    observations = list(scene.observations)
+    k = int(rng.integers(len(observations)))
+    o = observations[k]
+    data, c = o.data.copy(), int(rng.integers(len(o.channels)))
+    shape, sigma = np.array(data.shape[1:]), np.median(o.weights[c]) ** -0.5
+    length, angle = rng.uniform(*COSMIC_PX), rng.uniform(0, np.pi)
+    along = (np.arange(0, length, 0.7) - length / 2)[:, None] * [np.sin(angle), np.cos(angle)]
+    track = np.rint((shape - 1) / 2 + rng.normal(0, RAY_AWAY_PX, 2) + along).astype(int)
+    y, x = np.unique(np.clip(track, 0, shape - 1), axis=0).T
+    data[c, y, x] += sigma * log_uniform(rng, *COSMIC_SIGMA) * rng.uniform(0.5, 1.5, len(y))
+    observations[k] = changed(o, data=data)
+    return replace(scene, observations=tuple(observations))
+
+
 CASES = {
     f.__name__: f
     for f in (
         single, neighbour, pair, bulge_disk, giant, cosmos, star_as_galaxy, galaxy_as_point,
-        close,
+        close, ray,
     )
 }  # fmt: skip
 
@@ -193,4 +218,5 @@ def scene_of(case, mode, seed, i, limits=None):
     """The i-th scene of a case: the same one for the same seed, whatever else is drawn."""
     rng = np.random.default_rng((seed, list(CASES).index(case), MODES.index(mode), i))
     items = CASES[case](rng, instruments(mode)[0].scale_arcsec, limits or Limits())
-    return make_scene(mode, items, rng)
+    scene = make_scene(mode, items, rng)
+    return with_ray(scene, rng) if case == "ray" else scene

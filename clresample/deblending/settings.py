@@ -81,10 +81,10 @@ class Settings(FitSettings):
         observations (inspection/shifted.py), starting from the measured shift
     fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of source-free pixels
         and its error (inspection/levels.py), so that it does not absorb light of wide sources. If
-        no pixel is free of sources the constant is unconstrained. "auto" = only if source-free
-        pixels of an observation have a level of over 0.1 of a pixel's noise and 4 of its errors;
-        then those of all observations are fitted, within 0.1 of a pixel's noise where unknown.
-        "small" = always, within that where unknown: for skies that are nearly subtracted
+        no pixel is free of sources the constant is unconstrained. "auto" = only in observations
+        whose source-free pixels have a level of over 0.1 of a pixel's noise and 4 of its errors in
+        a channel; their other channels are within 0.1 of the noise of 0. "small" = always, and
+        within 0.05 of the noise where no level is shown: for skies that are nearly subtracted
     flux_error_floor: relative systematic flux error, added in quadrature,
         the same for all channels of a source. It covers model errors of bright galaxies, photon
         noise missing from the weights, and PSF errors. It applies to a galaxy that equals its

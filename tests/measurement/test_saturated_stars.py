@@ -9,6 +9,7 @@ from scipy.signal import fftconvolve
 from scipy.special import j1
 
 from clresample.deblending.batch import deblend
+from clresample.deblending.inspection import star_cores as star_cores_module
 from clresample.deblending.inspection.star_cores import StarCore, star_cores
 from clresample.deblending.inspection.star_profile import RadialProfile
 from clresample.deblending.inspection.star_psfs import _lasting
@@ -169,6 +170,14 @@ def test_bad_columns_and_masked_galaxies_are_no_stars():
     data = clean.data[0] + galaxy
     cores = star_cores(np.where(weights > 0, data / NOISE, 0), weights > 0, clean.psf, 0)
     assert [np.hypot(*(core.place - STAR)) < 1 for core in cores] == [True]
+
+
+def test_a_centre_far_from_the_masked_pixels_is_no_star(monkeypatch):
+    """As that of light which falls to one side of a gap: it took all of a field's tiles with it."""
+    (core,) = cores_of(starry())
+    far = core.place + (3e9, -1e9)
+    monkeypatch.setattr(star_cores_module, "_centred", lambda *given: (far, 0.1))
+    assert cores_of(starry()) == []
 
 
 @pytest.mark.parametrize("width, height, n", [(2, 4, 1), (1, 9, 0), (2, 0, 0)])

@@ -138,12 +138,19 @@ def _guesses(light, usable, masked):
 
 
 def _ring_about(light, usable, masked, guess, fwhm):
-    """The place (2,) [px] of a core, its ring, inner radius and scatter; None without a ring."""
+    """The place (2,) [px] of a core, its ring, inner radius and scatter.
+
+    None without a ring, and where its light is not centred on the core: it may fall to one side,
+    as from a centre that is far away.
+    """
+    y, x = np.nonzero(masked)
     for _ in range(2):  # ring and position depend on each other
         ring, inner = _ring(usable, masked, guess, fwhm)
         if ring is None:
             return None
         guess, scatter = _centred(light, ring, guess)
+        if np.hypot(y - guess[0], x - guess[1]).min() > fwhm:
+            return None
     return guess, ring, inner, scatter
 
 
