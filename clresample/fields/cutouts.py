@@ -97,9 +97,10 @@ class FieldCutouts:
     def _provenance(self) -> dict:
         """The provenance of the run; empty if it is not there."""
         try:
-            return json.loads((self.folder / PROVENANCE).read_text())
+            found = json.loads((self.folder / PROVENANCE).read_text())
         except (OSError, ValueError):
             return {}
+        return found if isinstance(found, dict) else {}
 
     def _note_changes(self, about, inputs):
         """Records inputs whose size or date differs from those of the run."""

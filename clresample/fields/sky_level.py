@@ -15,7 +15,8 @@ from .background import ConstantBackground, cell_edges
 FILE = "sky_levels.json"  # in the folder of a run
 # [px] Side of a cell, and the quantile of the cells' levels that is the sky's: the darkest have the
 # fewest sources. Errors are 0.00 to 0.02 of a pixel's noise in four fields of `simulate field --sky
-# real` and `bright`; with 128 px they are 0.01 to 0.06, as all cells have sources.
+# real` and `bright`; with 128 px they are 0.01 to 0.06, as all cells have sources. Without sources
+# levels of white noise are 0.025 too low, of noise smoothed by 0.7 px 0.05.
 CELL_PX, DARKEST = 64, 0.1
 # Largest number of cells that are measured, spread over an image, and the smallest number.
 MAX_CELLS, MIN_CELLS = 256, 16

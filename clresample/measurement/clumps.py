@@ -37,8 +37,8 @@ BODY_AREA = 100.0
 # [FWHM^2] The same for small galaxies, whose knots cannot be told from fainter neighbours; and part
 # of the galaxy's peak up to which they are in its group. Of rows of `simulate field --sky bright`,
 # seeds 2 and 3, that are neither in a group nor true sources, 22 are left of 82. Brighter peaks are
-# in it up to this contrast: ten of 19 such are sources of their own in `simulate field --sky real`,
-# seeds 1 to 6, and 11 of 16 of a higher contrast.
+# in it up to this contrast: ten of 19 such peaks are sources of their own in `simulate field --sky
+# real`, seeds 1 to 6, which no image can tell from knots.
 SMALL_AREA, TWIN, TWIN_CONTRAST = 20.0, 0.5, 1.0
 # [thresholds] Level of a body from which its peaks can be structure. Little of a fainter body is
 # above the noise, so that each of its peaks stays a source.

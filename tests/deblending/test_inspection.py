@@ -11,7 +11,7 @@ from clresample.deblending.inspection.inspect import (
     HELD_PART,
     SMALL_PART,
     _level_lines,
-    _shown_levels,
+    _wrong_levels,
     inspect,
 )
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
@@ -123,15 +123,20 @@ def test_a_wrong_sky_frees_those_of_all_observations():
     assert (np.abs(found.levels[0].level) < SMALL_PART * NOISE).all()
 
 
-def test_levels_that_are_not_shown_are_near_zero_and_others_as_measured_or_as_the_rim():
-    endless, zeros = np.full(6, np.inf), np.zeros(6)
-    level, error = np.array([0.7, 0.7, 0.0, 0.0, -0.7, -0.2]), np.array([1, 1, 1e300, 1e300, 1, 1])
-    error[2:4] = endless[2:4]
-    rim, rim_error = np.array([0.9, 0.9, -0.3, -0.3, -0.3, -0.3]), np.full(6, 0.02)
-    sky = levels.SkyLevel(level, error, zeros, rim, rim_error, None, None, zeros)
-    sky = sky.expected(np.array([True, False, True, False, True, True]), np.full(6, 0.1))
-    np.testing.assert_allclose(sky.level, [0.7, 0.7 / 101, -0.3, 0, -0.7, -0.3])
-    np.testing.assert_allclose(sky.error, [1, np.sqrt(1 / 101), 0.02, 0.1, 1, 0.02])
+@pytest.mark.parametrize("unit", [1.0, 1e-20, 1e20])
+def test_other_levels_are_near_zero_and_wrong_ones_as_measured_or_as_the_rim(unit):
+    level = np.array([0.7, 0.7, 0.0, 0.0, -0.7, 0.02])
+    error = np.array([1, 1, np.inf, np.inf, 1, 0.03])
+    rim, rim_error, zeros = (
+        np.array([0.9, 0.9, -0.3, -0.3, -0.3, -0.13]),
+        np.full(6, 0.02),
+        np.zeros(6),
+    )
+    given = (unit * one for one in (level, error, zeros, rim, rim_error))
+    wrong, dark = np.arange(6) == 0, np.isin(np.arange(6), (2, 4, 5))
+    sky = levels.SkyLevel(*given, None, None, zeros).expected(wrong, dark, np.full(6, 0.1 * unit))
+    np.testing.assert_allclose(sky.level / unit, [0.7, 0.7 / 101, -0.3, 0, -0.7, -0.13])
+    np.testing.assert_allclose(sky.error / unit, [1, np.sqrt(1 / 101), 0.02, 0.1, 1, 0.02])
 
 
 def test_a_level_under_wings_may_be_wrong():
@@ -140,9 +145,9 @@ def test_a_level_under_wings_may_be_wrong():
     for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
         sky = sky_of(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
-        shown = _shown_levels(looked_at(o), sky)
-        assert not shown.any()
-        found.append(_level_lines(looked_at(o), sky, shown, sky, False))
+        wrong, dark = _wrong_levels(looked_at(o), sky)
+        assert not (wrong | dark).any()
+        found.append(_level_lines(looked_at(o), sky, wrong, sky, False))
     (line,), *others = found
     assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line
     assert others == [[], []]
@@ -284,6 +289,19 @@ def test_a_ray_across_a_source_is_masked_along_its_track(slope):
     assert "cosmic rays" in message and "masked" in message
 
 
+def test_a_track_that_leaves_the_image_ends_at_its_edge():
+    sharp, cores = np.zeros((1, 40, 40), bool), np.zeros((40, 40), bool)
+    x = np.arange(10, 38)
+    for flip in (1, -1):
+        sharp[:] = False
+        sharp[0, x, x] = sharp[0, 38, 39] = True
+        found = spoilt.tracks(sharp[:, ::flip, ::flip], cores)[0, ::flip, ::flip]
+        assert found[x, x].all() and np.abs(np.subtract(*np.nonzero(found))).max() <= 1
+    block = np.zeros((1, 40, 40), bool)
+    block[0, 20:22, 20:22] = True
+    assert not spoilt.tracks(block, cores).any()
+
+
 def test_the_core_of_a_star_with_a_psf_too_wide_is_no_track():
     o = observed(image_of(((DRAWN[0][0], (2e4, 2e4), 0.0),)))
     wide = Observation(
@@ -340,6 +358,9 @@ def test_light_of_masked_pixels_and_beyond_the_edge_is_not_unlisted():
     rest = sources_of(DRAWN[1:])
     assert looked_at(o, rest).smooth.max() > 5 * listing.UNLISTED_SIGMAS
     assert listing.unlisted(looked_at(o, rest)) == []
+    masked = (y == 20) & (x == 19)  # a pixel hides no galaxy
+    o = observed(image_of(), weights=np.where(masked, 0, NOISE**-2) * np.ones((2, 1, 1)))
+    assert listing.unlisted(looked_at(o, rest))
     beside = ((0.2, 18.7), *DRAWN[0][1:])
     o = observed(image_of((beside, *DRAWN[1:])))
     assert listing.unlisted(looked_at(o, rest)) == []

@@ -15,10 +15,10 @@ from clresample.sky.box import Box
 REGION = Box(5, 9, 133, 137)  # of labels.npy, in the reference's pixels
 
 
-@pytest.mark.parametrize("x0", [61, 64, 66])
-def test_pixels_of_other_blends_have_no_weight_also_beyond_the_box(tmp_path, x0):
+@pytest.mark.parametrize("x0, angle_deg", [(61, 0), (64, 0), (66, 0), (64, 40)])
+def test_pixels_of_other_blends_have_no_weight_also_beyond_the_box(tmp_path, x0, angle_deg):
     """Cutouts of coarse pixels end up to a multiple of 4 of them beyond the blend's box."""
-    grids = Grid.flat((140, 150), 0.1), Grid.flat((44, 50), 0.3)
+    grids = Grid.flat((140, 150), 0.1), Grid.flat((44, 50), 0.3, angle_deg=angle_deg)
     reference, coarse = (Grid.from_wcs(g.to_wcs(ra_deg=10.0, dec_deg=-3.0), g.shape) for g in grids)
     psf = PSF.gaussian(1.5)
     mosaics = tuple(

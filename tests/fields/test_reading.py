@@ -10,10 +10,12 @@ from astropy.io import fits
 from clresample import PSF, Grid
 from clresample.cli import main
 from clresample.fields.background import find_background
+from clresample.fields.execution.folder import open_folder
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.field_toml.headers import mask_value, zero_point
 from clresample.fields.field_toml.keys import parse_field
 from clresample.fields.mosaic import Mosaic
+from clresample.fields.options import FieldOptions, RunProgress
 from clresample.fields.sky_level import (
     find_sky,
     measured_sky,
@@ -121,6 +123,18 @@ def test_a_sky_that_was_left_in_is_measured_once_and_subtracted(tmp_path, level)
     np.testing.assert_array_equal(channel.read(box), plain.read(box) - counts)
     (note,) = sky_notes([lowered], found)
     assert f"r {part:+.2f}" in note and "fit_sky=False" in note
+
+
+def test_levels_of_a_start_that_ended_before_the_search_are_measured_again(tmp_path):
+    image, options = _noise((640, 640)) + 0.4, FieldOptions()
+    grid, psf = Grid.flat(image.shape, 0.1), PSF.gaussian(2.0)
+    mosaic = Mosaic.of_arrays("A", image[None], grid, psf, weights=1.0)
+    given = tmp_path, [mosaic], mosaic.grid, options, False, False, RunProgress()
+    work, _ = open_folder(*given)
+    ((_, part),) = measured_sky([mosaic], work).values()
+    assert part > 0.3
+    work, _ = open_folder(*given)
+    assert not list(work.glob("sky*"))
 
 
 def _noise(shape=(1024, 1024)):

@@ -28,9 +28,9 @@ RIM_PART, RIM_SIGMAS = 0.4, 2.0
 # errors and this fraction of a pixel's noise: none of 400 clean simulated images reaches two
 # thirds.
 DOUBT_SIGMAS, DOUBT_PART = 1.5, 0.3
-# Fraction of a pixel's noise by which a fitted level may differ from 0 where it is not shown to: in
-# observations with another level that is, where nearly all of the sky was subtracted ("small"), and
-# in observations whose sky is not fitted while that of others is.
+# Fraction of a pixel's noise by which a fitted level may differ from 0 where it does not certainly:
+# where nearly all of the sky was subtracted ("small"), and in observations whose sky is not fitted
+# while that of others is. In observations that are fitted for another channel it is LEVEL_PART.
 SMALL_PART, HELD_PART = 0.05, 1e-3
 # Fraction of a pixel's noise above which the error of a fitted sky level is reported: it changes a
 # flux measured on 50 pixels by its own error.
@@ -92,17 +92,17 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        shown = _shown_levels(image, sky)
-        fitted = free or small or (auto and bool(shown.any()))
+        wrong, dark = _wrong_levels(image, sky)
+        fitted = free or small or (auto and bool((wrong | dark).any()))
         image, wide, own = with_star_psfs(image, sources, fitted, free)
         n_channels += wide, own, image.inside * len(image.usable)
         # the wings of a star that fill the image make its sky level uncertain
         unknown = bool(wide.any())
         if unknown:
             sky = replace(sky, error=np.full_like(sky.error, np.inf))
-            fitted, shown = free or small, np.zeros_like(shown)
+            fitted, wrong, dark = free or small, np.zeros_like(wrong), np.zeros_like(dark)
         part = SMALL_PART if small else LEVEL_PART if fitted else HELD_PART
-        expected = sky if free else sky.expected(shown, part * image.sigma)
+        expected = sky if free else sky.expected(wrong, dark, part * image.sigma)
         levels.append((sky, expected))
         fit_sky = fit_sky or fitted
         lines = _unmeasured(image)
@@ -110,7 +110,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
             about = (
                 _unsure_lines(image, sky)
                 if free
-                else _level_lines(image, sky, shown, expected, fitted)
+                else _level_lines(image, sky, wrong | dark, expected, fitted)
             )
             lines += about + noise_lines(image, sky)
         lines += more + _coarse(observation.psf, observation.channels)
@@ -159,15 +159,20 @@ def _unmeasured(image):
     ]
 
 
-def _shown_levels(image, sky):
-    """Selects channels (C,) whose sky is certainly not zero: by their SkyLevel, or a dark rim."""
+def _wrong_levels(image, sky):
+    """Selects channels (C,) whose sky is certainly not zero.
+
+    By their SkyLevel, and of others by their rim: light is positive, so the sky of a rim below zero
+    is too dark.
+    """
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known = np.isfinite(error)
     wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
     mean, total = _common_level(image, sky)
     if abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART):
         wrong |= known & (part * mean > 0)
-    return wrong | _dark_rim(image, sky)
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    return wrong, ~wrong & (rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART))
 
 
 def _common_level(image, sky):
@@ -183,16 +188,10 @@ def _common_level(image, sky):
     return part.mean(), np.hypot(wings.mean(), np.sqrt(own) / len(part))
 
 
-def _dark_rim(image, sky):
-    """Selects channels (C,) whose rim is below zero: light is positive, so the sky is too dark."""
-    rim, error = sky.rim / image.sigma, sky.rim_error / image.sigma
-    return rim < -np.maximum(LEVEL_SIGMAS * error, LEVEL_PART)
-
-
 def _level_lines(image, sky, shown, expected, fitted):
     """Messages about a SkyLevel other than zero, and about light at the rim.
 
-    shown (C,): bool, channels by `_shown_levels`; expected: SkyLevel of the fit; fitted: True if it
+    shown (C,): bool, channels by `_wrong_levels`; expected: SkyLevel of the fit; fitted: True if it
         is fitted
     """
     lines = []

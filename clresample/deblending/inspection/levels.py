@@ -96,18 +96,19 @@ class SkyLevel:
     dark: np.ndarray
     block_scatter: np.ndarray
 
-    def expected(self, shown, width) -> SkyLevel:
-        """The SkyLevel that a fit expects in channels `shown` (C,) not to be at 0, and in others.
+    def expected(self, wrong, dark, width) -> SkyLevel:
+        """The SkyLevel that a fit expects: as measured in channels `wrong` (C,), that are not at 0.
 
-        The former are as measured, or as their rim if it is below a level that is uncertain by more
-        than `width` (C,) [counts]. The others are measured too, and expected within `width` of 0: a
-        larger error would leave the light of wide sources to the sky.
+        In channels `dark` (C,), whose rim shows that, it is the rim's if the level is above it.
+        Others are measured too, and expected within `width` (C,) [counts] of 0: a larger error
+        would leave the light of wide sources to the sky.
         """
-        dark = shown & (self.rim < np.minimum(self.level, 0)) & (self.error > width)
-        level = np.where(dark, self.rim, self.level)
-        error = np.where(dark, np.minimum(self.rim_error, width), self.error)
-        part = np.where(shown, 1, width**2 / (width**2 + np.minimum(error, 1e150) ** 2))
-        error = np.where(shown, error, np.sqrt(part) * np.minimum(error, 1e150))
+        by_rim = dark & (self.rim < self.level)
+        level = np.where(by_rim, self.rim, self.level)
+        error = np.where(by_rim, np.minimum(self.rim_error, width), self.error)
+        shown = wrong | dark
+        part = np.where(shown, 1, 1 / (1 + (error / width) ** 2))
+        error = np.where(shown, error, width * np.sqrt(np.maximum(1 - part, 0)))
         return replace(self, level=part * level, error=error)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_opening, distance_transform_edt
 
 from .centroids import common, over_channels
 
@@ -19,8 +19,8 @@ UNLISTED_PART = 0.25
 # [FWHM of the PSF] Light nearer to a listed source belongs to it; at least in pixels.
 OWN_FWHM, OWN_PX = 1.5, 3.0
 # [1] of a peak: light that stays above this level up to a listed source belongs to that source, up
-# to a masked pixel or the edge to what lies there.
-SADDLE_PART = 0.5
+# to the edge or a masked part of the image to what lies there. [px] Smallest side of such a part.
+SADDLE_PART, MASKED_PX = 0.5, 3
 N_NEAREST = 6  # number of the nearest sources that light may belong to
 # [px], [sigma] Smallest common offset of all positions that is reported, and its significance.
 OFFSET_PX, OFFSET_SIGMAS = 0.6, 4.0
@@ -67,10 +67,11 @@ def unlisted(image):
     if not image.inside.any():
         return []  # sources all lie outside, which is reported by itself
     # masked pixels may be of any brightness
-    usable = np.pad(image.usable.all(axis=0), 1)
-    smooth = np.where(usable[1:-1, 1:-1], image.smooth, np.inf)
-    indices = distance_transform_edt(usable, return_distances=False, return_indices=True)
-    unseen = np.moveaxis(indices[:, 1:-1, 1:-1], 0, -1) - 1
+    smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
+    beyond = np.pad(~image.usable.any(axis=0), MASKED_PX, constant_values=True)
+    beyond = binary_opening(beyond, np.ones((MASKED_PX, MASKED_PX), bool))
+    nearest = distance_transform_edt(~beyond, return_distances=False, return_indices=True)
+    unseen = np.moveaxis(nearest, 0, -1)[MASKED_PX:-MASKED_PX, MASKED_PX:-MASKED_PX] - MASKED_PX
     own = max(OWN_FWHM * image.width_px, OWN_PX)
     least = UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
     found = []
@@ -79,8 +80,8 @@ def unlisted(image):
         away = np.hypot(*(places - (y, x)).T)
         if value < least or away.min() < own:
             continue
-        nearest = [unseen[y, x], *places[away.argsort()[:N_NEAREST]]]
-        if not any(_joined(smooth, (y, x), value, place) for place in nearest):
+        ends = [unseen[y, x], *places[away.argsort()[:N_NEAREST]]]
+        if not any(_joined(smooth, (y, x), value, place) for place in ends):
             found.append((float(value), int(y), int(x)))
     return sorted(found, reverse=True)
 

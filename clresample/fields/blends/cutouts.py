@@ -22,8 +22,8 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None)
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
     patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
-    labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on, also of
-        those `beyond_px` around the patch's box
+    labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on, at
+        least those of `cutouts_box`
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None = their pixels are ignored, like those of
         all other blends
@@ -101,13 +101,16 @@ def fit_box(mosaic, grid) -> Box:
     return box_within(there, margin, SIDE_PX, Box.of(mosaic.grid.shape))
 
 
-def beyond_px(mosaics, reference) -> int:
-    """Largest distance [px] in the model's pixels from a patch's box to pixels of its cutouts.
-
-    `fit_box` adds pixels of a mosaic: a margin, and up to a multiple of SIDE_PX.
-    """
-    coarsest = max(mosaic.grid.pixel_scale_arcsec for mosaic in mosaics)
-    return int(np.ceil((SIDE_PX + 1) * coarsest / reference.pixel_scale_arcsec)) + 1
+def cutouts_box(patch, mosaics, reference) -> Box:
+    """The Box of the model's pixels in which all pixels of a patch's cutouts lie."""
+    grid, whole = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape), patch.box
+    for mosaic in mosaics:
+        box = fit_box(mosaic, grid)
+        ends = np.array([box[:2], (box.y0, box.x1), (box.y1, box.x0), box[2:]]) - 0.5
+        there = mosaic.grid.positions_in(reference, *ends.T)
+        if box.area and np.isfinite(there).all():
+            whole = whole.union(Box.around(there))
+    return whole
 
 
 def _foreign(patch, labels, siblings_too):

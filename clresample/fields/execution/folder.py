@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...files.atomic import FileError, atomic_file, check_folder, remove_stale, remove_tree
+from ..sky_level import FILE as SKY_FILE
 from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
@@ -46,6 +47,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         return work, replace(options, group_memory=before["memory"])
     try:
         work.mkdir(parents=True, exist_ok=True)
+        (work / SKY_FILE).unlink(missing_ok=True)  # of a start that ended before the search
     except OSError as error:
         raise FileError(f"{work}: cannot be made ({error.strerror or error})") from error
     with atomic_file(there) as part:

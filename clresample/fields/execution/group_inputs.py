@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.box import Box
-from ..blends.cutouts import beyond_px
+from ..blends.cutouts import cutouts_box
 from .group_results import GroupResultsFile
 
 
@@ -53,9 +53,10 @@ def gather_inputs(job, group) -> GroupInputs:
     """Reads the inputs of a group from the run's folder. Raises FileError, OSError."""
     whole = np.load(job.folder / "labels.npy", mmap_mode="r")
     region = Box.of(whole.shape)
-    labels, beyond = {}, beyond_px(job.mosaics, job.reference)
+    labels = {}
     for number in group.patches:
-        box, (y, x) = job.plan.patches[number].box.grown(beyond), job.origin_px
+        box = cutouts_box(job.plan.patches[number], job.mosaics, job.reference)
+        y, x = job.origin_px
         there = Box(box.y0 - y, box.x0 - x, box.y1 - y, box.x1 - x).intersection(region)
         corner = there.y0 + y, there.x0 + x
         labels[number] = corner, np.array(whole[there.slices])
