@@ -60,30 +60,34 @@ def common_offset(found):
 def unlisted(image):
     """Peaks [(significance [sigma], y, x [px])] without a source at them, the brightest first."""
     peaks = _peaks(image.smooth)
-    peaks = peaks[image.on_frame(peaks)]  # other pixels are not fitted
-    if not len(peaks):
-        return []
     places = image.places[np.isfinite(image.places).all(axis=1)]
-    if not image.inside.any():
-        return []  # sources all lie outside, which is reported by itself
+    if not len(peaks) or not image.inside.any():
+        return []  # sources that all lie outside are reported by themselves
+    values = image.smooth[*peaks.T]
+    away = np.hypot(*(peaks[:, None] - places).T).T
+    apart = away.min(axis=1) >= max(OWN_FWHM * image.width_px, OWN_PX)
+    bright = values >= UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
+    chosen = np.flatnonzero(apart & bright & image.on_frame(peaks))  # other pixels are not fitted
+    if not len(chosen):
+        return []
     # masked pixels may be of any brightness
     smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
-    beyond = np.pad(~image.usable.any(axis=0), MASKED_PX, constant_values=True)
-    beyond = binary_opening(beyond, np.ones((MASKED_PX, MASKED_PX), bool))
-    nearest = distance_transform_edt(~beyond, return_distances=False, return_indices=True)
-    unseen = np.moveaxis(nearest, 0, -1)[MASKED_PX:-MASKED_PX, MASKED_PX:-MASKED_PX] - MASKED_PX
-    own = max(OWN_FWHM * image.width_px, OWN_PX)
-    least = UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
-    found = []
-    for y, x in peaks:
-        value = image.smooth[y, x]
-        away = np.hypot(*(places - (y, x)).T)
-        if value < least or away.min() < own:
-            continue
-        ends = [unseen[y, x], *places[away.argsort()[:N_NEAREST]]]
-        if not any(_joined(smooth, (y, x), value, place) for place in ends):
-            found.append((float(value), int(y), int(x)))
+    unseen, found = _nearest_unseen(image.usable.any(axis=0)), []
+    for i in chosen:
+        y, x = peaks[i]
+        ends = [unseen[y, x], *places[away[i].argsort()[:N_NEAREST]]]
+        if not any(_joined(smooth, (y, x), values[i], place) for place in ends):
+            found.append((float(values[i]), int(y), int(x)))
     return sorted(found, reverse=True)
+
+
+def _nearest_unseen(usable):
+    """The nearest pixel (My, Mx, 2) to each that is beyond the edge or in a masked part."""
+    unseen = np.pad(~usable, MASKED_PX, constant_values=True)
+    unseen = binary_opening(unseen, np.ones((MASKED_PX, MASKED_PX), bool))
+    nearest = distance_transform_edt(~unseen, return_distances=False, return_indices=True)
+    inner = slice(MASKED_PX, -MASKED_PX)
+    return np.moveaxis(nearest, 0, -1)[inner, inner] - MASKED_PX
 
 
 def _peaks(smooth):
