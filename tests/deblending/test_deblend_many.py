@@ -189,7 +189,8 @@ def test_device_memory_stays_constant(device, monkeypatch):
     rng = np.random.default_rng(0)
 
     def tiny(i):
-        data = rng.normal(size=(20, 22)) + 50 * (np.indices((20, 22)).sum(0) == 20)
+        data = rng.normal(size=(20, 22))
+        data[5:16, 5:16] += 500 * psf.images[0]
         o = Observation(data, psf, grid, weights=1.0, channels=("r",), name="r")
         return Blend((o,), (PointSource(position_px=(10, 10)),), Frame(grid, psf_in))
 

@@ -2,9 +2,19 @@
 
 import numpy as np
 import pytest
+from helpers.inspection import (
+    DRAWN,
+    FWHM_SIGMA,
+    NOISE,
+    SHAPE,
+    image_of,
+    inspected,
+    looked_at,
+    observed,
+    sources_of,
+)
 
-from clresample.deblending.blend import Blend
-from clresample.deblending.inspection import disagreement, levels, listing, shifted, spoilt
+from clresample.deblending.inspection import disagreement, levels, listing, shifted
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import (
@@ -12,61 +22,16 @@ from clresample.deblending.inspection.inspect import (
     SMALL_PART,
     _level_lines,
     _wrong_levels,
-    inspect,
 )
-from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
-from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
-from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource, PointSource
-
-SHAPE, NOISE, FWHM_SIGMA = (64, 60), 2.0, 1.5
-# (y, x) [px], flux [counts] in two channels, sigma [px] of the galaxy before the PSF; 0: a star
-DRAWN = (((20.2, 18.7), (3000, 5000), 1.5), ((24.0, 41.3), (2500, 1500), 2.0))
-DRAWN += (((47.6, 30.1), (2000, 3000), 0.0),)
-
-
-def image_of(drawn=DRAWN, *, seed=0, sky=0.0, sigma=FWHM_SIGMA, shape=SHAPE, noise=NOISE):
-    """Data (2, Ny, Nx) of Gaussian galaxies behind a Gaussian PSF of `sigma` [px]."""
-    y, x = np.indices(shape)
-    data = np.random.default_rng(seed).normal(sky, noise, (2, *shape))
-    for (a, b), fluxes, size in drawn:
-        s2 = size**2 + sigma**2 + 1 / 12
-        light = np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * s2)) / (2 * np.pi * s2)
-        data += np.array(fluxes)[:, None, None] * light
-    return data
-
-
-def observed(data, *, sigma=FWHM_SIGMA, name="cam", channels=("g", "r"), **given):
-    grid = Grid.flat(data.shape[-2:], 0.2)
-    given = {"weights": NOISE**-2} | given
-    return Observation(data, PSF.gaussian(sigma), grid, name=name, channels=channels, **given)
-
-
-def sources_of(drawn=DRAWN, kind=ExtendedSource):
-    return tuple(kind(position_px=place) for place, _, _ in drawn)
-
-
-def inspected(observations, sources=None, **settings):
-    blend = Blend(tuple(observations), sources or sources_of())
-    frame = model_frame(blend.observations)
-    shifts = np.zeros((len(blend.observations), 2))
-    positions = frame.positions_of(blend.sources, blend.observations)
-    return inspect(blend, frame, positions, shifts, Settings(**settings))
 
 
 def sky_of(*numbers):
     blocks = levels.BlockGrid.of(SHAPE)
     return levels.SkyLevel(*numbers, blocks, np.zeros((2, len(blocks.centers())), bool), np.ones(2))
-
-
-def looked_at(observation, sources=None):
-    frame = model_frame([observation])
-    return InspectedImage.of(
-        observation, frame, frame.positions_of(sources or sources_of()), np.zeros(2)
-    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -164,182 +129,6 @@ def test_wings_are_no_sky():
     (message,) = inspected([o], source).messages
     assert "the pixels furthest from the sources are not dark" in message
     assert inspected([o], source, fit_sky="small").messages == [message]
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_smooth_noise_and_integers_scatter_as_their_weights_say(seed):
-    from scipy.ndimage import gaussian_filter
-
-    noise = gaussian_filter(np.random.default_rng(seed).normal(size=(2, *SHAPE)), (0, 1, 1))
-    data = image_of(noise=0) + NOISE * noise / noise.std()
-    assert inspected([observed(data, noise="estimate")]).messages == []
-    data = np.rint(image_of(noise=0.5, seed=seed))
-    weights = 1 / (0.5**2 + 1 / 12)
-    assert inspected([observed(data, weights=weights)]).messages == []
-
-
-@pytest.mark.parametrize("width, declared", [(0.0, None), (0.6, None), (0.6, "estimate")])
-def test_correlated_noise_is_named_unless_it_is_declared(width, declared):
-    from scipy.ndimage import gaussian_filter
-
-    noise = gaussian_filter(np.random.default_rng(3).normal(size=(2, *SHAPE)), (0, width, width))
-    data = image_of(noise=0) + NOISE * noise / noise.std()
-    found = inspected([observed(data, noise=declared)]).messages
-    assert len(found) == (width > 0 and declared is None)
-    for message in found:
-        assert 'noise="estimate"' in message and "(g)" in message and "(r)" in message
-        ratio = float(message.partition("scatter ")[2].split()[0])
-        assert ratio == pytest.approx(1 / noise.std(), rel=0.3)
-
-
-@pytest.mark.parametrize("factor", [0.7, 1.4])
-def test_wrong_weights_are_named(factor):
-    (message,) = inspected([observed(image_of(), weights=(factor * NOISE) ** -2)]).messages
-    stated = float(message.partition("scatter by ")[2].split()[0])
-    assert stated == pytest.approx(1 / factor, rel=0.1) and "scale weights" in message
-
-
-def test_levels_allow_for_correlated_noise():
-    from scipy.ndimage import gaussian_filter
-
-    white = np.random.default_rng(3).normal(0, 1, (2, 96, 96))
-    data = gaussian_filter(white, (0, 2, 2))
-    data *= NOISE / data.std()
-    level = levels.sky_level(looked_at(observed(data)))
-    alone = levels.sky_level(looked_at(observed(NOISE * white)))
-    assert (level.error > 3 * alone.error).all()
-
-
-@pytest.mark.parametrize("at", [(8, 50), (33, 8)])
-def test_cosmic_rays_are_masked(at):
-    data = image_of()
-    for k in range(6):  # a slanted track
-        data[1, at[0] + k // 2, at[1] + k] += 60 * NOISE
-    o = observed(data)
-    found = inspected([o])
-    (message,) = found.messages
-    assert "channel r has 6 pixels sharper than its PSF" in message and str(at) in message
-    weights = found.blend.observations[0].weights
-    assert (weights[1, at[0] : at[0] + 2, at[1] : at[1] + 3] == 0).all()
-    assert (weights == 0).sum() < 40 and (weights[0] > 0).all()
-    assert (o.weights > 0).all()  # the user's own stays
-
-
-@pytest.mark.parametrize("given_sigma", [FWHM_SIGMA, 1.3 * FWHM_SIGMA])
-def test_stars_are_never_masked(given_sigma):
-    """Nor where the PSF is too wide, nor where nobody listed them."""
-    stars = tuple((p, (1e5, 1e5), 0.0) for p, _, _ in DRAWN)
-    found = inspected(
-        [observed(image_of(stars), sigma=given_sigma)], sources_of(stars[:1], PointSource)
-    )
-    assert all((o.weights > 0).all() for o in found.blend.observations)
-
-
-@pytest.mark.parametrize("sigma", [0.3, 0.5, 0.8, 1.5])
-def test_no_point_behind_a_psf_has_less_contrast(sigma):
-    psf = PSF.gaussian(sigma)
-    kappa = pair_ratios(psf)[0]
-    rng = np.random.default_rng(0)
-    for y, x in rng.uniform(-0.5, 0.5, (20, 2)):
-        p = psf_at(psf, 0, np.arange(-1.0, 2) - y, np.arange(-1.0, 2) - x)
-        assert p[0, 1] + p[2, 1] >= kappa[0] * p[1, 1] and p[1, 0] + p[1, 2] >= kappa[1] * p[1, 1]
-
-
-def test_hot_pixels_on_a_source_are_said_and_stay():
-    data = image_of()
-    data[0, 20, 19] += 300 * NOISE
-    found = inspected([observed(data)])
-    assert any(
-        "light sharper than its PSF at (y, x) = (20, 19), on a source" in m for m in found.messages
-    )
-    assert (found.blend.observations[0].weights > 0).all()
-
-
-def test_light_sharp_in_two_channels_stays():
-    data = image_of()
-    data[:, 8, 50] += 60 * NOISE
-    found = inspected([observed(data)])
-    assert any("(y, x) = (8, 50), in other channels too" in m for m in found.messages)
-    assert (found.blend.observations[0].weights > 0).all()
-
-
-def test_noise_above_that_of_the_weights_is_no_ray():
-    seen = looked_at(observed(image_of(noise=4 * NOISE)))
-    assert (seen.significance < -spoilt.SHARP_SIGMAS).any()
-    assert not spoilt.sharper_than_psf(seen).any()
-
-
-def test_equal_pixels_around_a_brighter_one_are_no_flat_top():
-    data = image_of()
-    data[0, 7:10, 49:52], data[0, 8, 50] = 900.5, 2000.5
-    assert not spoilt.saturated(looked_at(observed(data))).any()
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.4, 1.0])
-def test_a_ray_across_a_source_is_masked_along_its_track(slope):
-    data, (y0, x0) = image_of(), DRAWN[0][0]
-    x = np.arange(int(x0) - 6, int(x0) + 7)
-    y = np.rint(y0 + slope * (x - x0)).astype(int)
-    data[0, y, x] += 60 * NOISE
-    found = inspected([observed(data)])
-    weights = found.blend.observations[0].weights
-    assert (weights[0, y, x] == 0).all() and (weights[1] > 0).all()
-    assert (weights[0] == 0).sum() <= 7 * len(x)
-    (message,) = found.messages
-    assert "cosmic rays" in message and "masked" in message
-
-
-def test_a_track_that_leaves_the_image_ends_at_its_edge():
-    sharp, cores = np.zeros((1, 40, 40), bool), np.zeros((40, 40), bool)
-    x = np.arange(10, 38)
-    for flip in (1, -1):
-        sharp[:] = False
-        sharp[0, x, x] = sharp[0, 38, 39] = True
-        found = spoilt.tracks(sharp[:, ::flip, ::flip], cores)[0, ::flip, ::flip]
-        assert found[x, x].all() and np.abs(np.subtract(*np.nonzero(found))).max() <= 1
-    block = np.zeros((1, 40, 40), bool)
-    block[0, 20:22, 20:22] = True
-    assert not spoilt.tracks(block, cores).any()
-
-
-def test_the_core_of_a_star_with_a_psf_too_wide_is_no_track():
-    o = observed(image_of(((DRAWN[0][0], (2e4, 2e4), 0.0),)))
-    wide = Observation(
-        o.data[:1],
-        PSF(o.psf.images[:1] @ gaussian_of(3.0, o.psf.images.shape[-1])),  # along x
-        o.grid,
-        weights=o.weights[:1],
-        channels=["g"],
-    )
-    found = inspected([wide], sources_of(DRAWN[:1], PointSource))
-    assert (found.blend.observations[0].weights > 0).all()
-    assert any("sharper than its PSF" in m for m in found.messages)
-
-
-def gaussian_of(sigma, n):
-    """Matrix (n, n) of a convolution with a Gaussian."""
-    away = np.arange(n) - np.arange(n)[:, None]
-    return np.exp(-(away**2) / (2 * sigma**2)) / (sigma * np.sqrt(2 * np.pi))
-
-
-def test_flat_tops_are_masked_as_saturated():
-    data = image_of(((DRAWN[0][0], (9e4, 9e4), 0.0), *DRAWN[1:]))
-    data[1] = np.minimum(data[1], 0.6 * data[1].max())
-    found = inspected([observed(data)])
-    assert [m for m in found.messages if "channel r is saturated" in m]
-    weights = found.blend.observations[0].weights
-    assert (weights[1, 19:22, 17:21] == 0).all() and (weights[0] > 0).all()
-
-
-def test_whole_numbers_are_not_flat_by_chance():
-    assert not spoilt.saturated(looked_at(observed(np.rint(image_of())))).any()
-
-
-def test_values_at_the_saturation_are_masked():
-    o = observed(image_of())
-    object.__setattr__(o, "saturation", np.array([np.nan, 100.0]))
-    full = spoilt.saturated(looked_at(o))
-    assert not full[0].any() and full[1][o.data[1] >= 100].all()
 
 
 def test_light_without_a_source_is_named():
