@@ -62,8 +62,9 @@ class FieldCutouts:
         self.group_ids = self._columns.get("group_id", self.ids).astype(np.int64)
         self._row = {one: row for row, one in enumerate(self.ids.tolist())}
         self._models = ModelFile(self.folder / "models.fits")
-        mosaics = tuple(self._read_mosaics() if mosaics is None else mosaics)
-        self.mosaics = without_sky(mosaics, self._provenance().get("sky_levels", {}))
+        about = self._provenance()
+        mosaics = tuple(self._read_mosaics(about) if mosaics is None else mosaics)
+        self.mosaics = without_sky(mosaics, about.get("sky_levels", {}))
         names = tuple(c.name for m in self.mosaics for c in m.channels)
         if names != self._models.channels:
             raise FileError(
@@ -73,9 +74,8 @@ class FieldCutouts:
         self._reference = reference_grid(self.mosaics)
         self._light = ModelLight(self._models, self.mosaics, self._reference, device)
 
-    def _read_mosaics(self):
-        """Reads the mosaics of the run's field file."""
-        about = self._provenance()
+    def _read_mosaics(self, about):
+        """Reads the mosaics of the run's field file; about: the run's provenance."""
         try:
             given = Path(about["inputs"]["field"]["file"])
         except (KeyError, TypeError):
