@@ -19,9 +19,9 @@ import numpy as np
 
 from ..sky.fourier import is_mirror_symmetric
 from ..sky.mapping import Mapping, PaddedMapping
-from ..sky.psf import PSF, crop_psf
+from ..sky.psf import PSF, crop_psf, cut_psf
 from .gridding import KaiserBessel, LineTaps
-from .transfer import Certificate, transfer_function, wrap_radius
+from .transfer import WRAP_MARGIN, Certificate, transfer_function, wrap_radius
 from .wave_tables import aligned_tables, distorted_tables, line_tables, uniform_wave_table
 
 # [bytes] Largest tables of one operator. Frames of 7000 pixels a side reach it; they take minutes,
@@ -127,13 +127,17 @@ class ResamplingPlan:
             mapping = PaddedMapping.for_box(self.mapping, shape, reach_px, size)
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
+            radius = np.minimum(self.certificate.wrap_radius_px, WRAP_MARGIN * reach_px)
+            # distances in observed pixels up to which light is within the radius
+            seen = np.abs(np.linalg.inv(self.mapping.matrix)) @ radius
             self.windows[key] = make_resampling_plan(
                 mapping,
-                *self.psfs,
+                self.psfs[0],
+                cut_psf(self.psfs[1], seen),
                 precision=precision,
                 extent=extent,
                 n_terms=self.n_terms,
-                radius=self.certificate.wrap_radius_px,
+                radius=tuple(radius.tolist()),
             )
         return self.windows[key]
 

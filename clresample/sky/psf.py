@@ -230,9 +230,11 @@ def _waves(frequencies, first, step, n):
 def _transform(psf, bands, center, nu_y, nu_x, matrix):
     """`otf` of some bands, all centred at `center`, without the band's edge: (bands, Ky, Kx)."""
     images = psf.images[bands]
+    # smaller images of some bands have zeros around them
+    (y1, y2), (x1, x2) = (_lit(np.any(images, axis=(0, axis)), 0) for axis in (2, 1))
+    images, y0, x0 = images[:, y1:y2, x1:x2], center[0] - y1, center[1] - x1
     n_y, n_x = images.shape[1:]
     (a, b), (c, d) = matrix * psf.spacing
-    (y0, x0) = center
 
     # f.(u, v) = nu_y (a u + b v) + nu_x (c u + d v), u and v in samples from the centre
     def along_y(nu, rate):
@@ -290,6 +292,23 @@ def crop_psf(psf, share):
         return psf
     images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
     return psf.restore(images, spacing=psf.spacing, center=center)
+
+
+def cut_psf(psf, radius):
+    """A PSF's samples within `radius` (2,) [px] along y and x of each band's centre.
+
+    Not divided by its sum again.
+    """
+    given = np.array(psf.images.shape[1:])
+    size = np.minimum(2 * np.ceil(radius / psf.spacing).astype(int) + 1, given)
+    if (size == given).all():
+        return psf
+    first = np.clip(np.rint(psf.center).astype(int) - size // 2, 0, given - size)
+    images = [
+        image[y : y + size[0], x : x + size[1]]
+        for image, (y, x) in zip(psf.images, first.tolist(), strict=True)
+    ]
+    return psf.restore(np.stack(images), spacing=psf.spacing, center=psf.center - first)
 
 
 def _lit(light, share):

@@ -24,7 +24,7 @@ SEEN = [2, 0]  # the scenes that are looked at
 class Sums:
     """A Sight whose pixels are one row, in NumPy: of random images, roots and data."""
 
-    ties = None
+    ties, aim = None, SimpleNamespace(is_exact=True)
 
     def __init__(self, channels, seed):
         rng = np.random.default_rng(seed)
@@ -40,7 +40,8 @@ class Sums:
             self.images[DARK] = 0
         self.whitened = 0
 
-    def render(self, slots, _images):
+    def render(self, slots, _images, level):
+        assert len(level) == len(slots)
         self.slots, self.whitened = slots, 0
         self.at = [slots.numbers[i] for i in slots.order]
 
@@ -93,7 +94,7 @@ class Listed(SimpleNamespace):
 def posed(monkeypatch):
     """Makes a LinearisedScenes at Sums of scenes."""
 
-    def slots(chosen, thetas, boxes, *, slopes):
+    def slots(chosen, thetas, boxes, *, slopes, levels):
         order = np.random.default_rng(3).permutation(len(chosen))
         numbers = [c.number for c in chosen]
         counts = (1 + slopes * np.array([PARTS[i][2] for i in numbers]))[order]

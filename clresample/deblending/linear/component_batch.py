@@ -115,16 +115,17 @@ class ComponentBatch:
 
     components (n): any; thetas (n): their parameters; boxes (n, 2, 2): origins and sizes
     slopes: True to draw slopes with the profiles, or bool (n,) for each
+    levels (..., n): by which they are ordered, see RenderPlanner.levels
 
     order (n,): the components in the order of the slots; scene, n_images (n,), origin, size (n, 2),
     begin (n,): first element of each slot's images in the device array that `draw` returns
     """
 
-    def __init__(self, components, thetas, boxes, *, slopes):
+    def __init__(self, components, thetas, boxes, *, slopes, levels=()):
         scene = np.array([c.scene for c in components])
         origin, size = np.reshape(boxes, (-1, 2, 2)).swapaxes(0, 1)
         count = 1 + slopes * np.array([len(theta) for theta in thetas])
-        self.order = order = np.lexsort((scene, count, size[:, 1], size[:, 0]))
+        self.order = order = np.lexsort((scene, *levels, count, size[:, 1], size[:, 0]))
         self.components = [components[i] for i in order]
         self.thetas = [thetas[i] for i in order]
         self.scene, self.n_images = scene[order], count[order]

@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from ...device.tuning import Tuning
-from .component_batch import ComponentBatch, boxes_of, profile_thresholds, renumbered
+from .component_batch import (
+    ComponentBatch,
+    boxes_of,
+    peaks_of,
+    profile_thresholds,
+    renumbered,
+)
 from .equations import ImageProducts
 from .slot_observation import SlotObservation
 from .spectra import nnls_batch, spectrum_covariance
@@ -72,16 +78,24 @@ class LinearisedScenes:
         chosen, theta = [self.components[i] for i in at], [thetas[i] for i in at]
         boxes = boxes_of(chosen, theta, profile_thresholds(brightness[at]))
         slopes = np.broadcast_to(slopes, len(self.components))[at]
-        self.slots = ComponentBatch(chosen, theta, boxes, slopes=slopes)
+        levels = self._levels(chosen, theta, brightness[at])
+        self.slots = ComponentBatch(chosen, theta, boxes, slopes=slopes, levels=levels)
         self.at = at[self.slots.order]
         self._row = np.full(self.n_scenes, -1)
         self._row[self.scenes] = np.arange(len(self.scenes))
         images = self.slots.draw(self.device, self.dtype, self.tuning, self._kept)
-        for sight in self.sights:
-            sight.render(self.slots, images)
+        for sight, level in zip(self.sights, levels, strict=True):
+            sight.render(self.slots, images, level[self.slots.order])
         self.overlapping_pairs = [sight.overlapping_pairs() for sight in self.sights]
         if whiten:
             self.whiten()
+
+    def _levels(self, components, thetas, brightness):
+        """`RenderPlanner.levels` of components in each observation (observations, n)."""
+        if self.sights[0].aim.is_exact:
+            return np.zeros((len(self.sights), len(components)), int)
+        flux = brightness / peaks_of(components, thetas)
+        return np.array([sight.aim.levels(components, flux) for sight in self.sights])
 
     def put(self, values):
         """Values on the device, in its precision."""

@@ -18,6 +18,24 @@ def reach_of(plan: ResamplingPlan, tolerance=0.0):
     return light_reach(plan.psfs[1], plan.mapping.matrix, tolerance)
 
 
+def wing_light(plan: ResamplingPlan, reaches):
+    """Root (C T, K) [1 / model px] of the PSF's squared light beyond distances, of each band.
+
+    It is the signal to noise of light beyond them, for a flux of 1 and a noise of 1 in a model
+    pixel.
+
+    reaches (K,) [model px]: descending
+    """
+    psf, matrix, found = plan.psfs[1], plan.mapping.matrix, []
+    stretch, area = np.linalg.norm(matrix, axis=1).max(), abs(np.linalg.det(matrix))
+    for image, center in zip(psf.images, psf.center, strict=True):
+        y, x = ((np.arange(n) - c) * psf.spacing for n, c in zip(image.shape, center, strict=True))
+        ring = np.searchsorted(reaches[::-1], stretch * np.hypot(y[:, None], x))
+        power = np.bincount(ring.ravel(), image.ravel() ** 2, len(reaches) + 1)
+        found.append(np.cumsum(power[:0:-1]))
+    return np.sqrt(found) / (psf.spacing * np.sqrt(area))
+
+
 def place_windows(offset, matrix):
     """Whole pixels (n, 2) by which windows move, and the rest of their offsets (n, 2) [model px].
 

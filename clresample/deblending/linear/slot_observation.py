@@ -92,11 +92,11 @@ class SlotObservation:
         )
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 
-    def render(self, slots: ComponentBatch, images):
-        """Renders the slots' images and stores their observed parts."""
+    def render(self, slots: ComponentBatch, images, level):
+        """Renders the slots' images, stores their observed parts; level: see RenderPlanner.runs."""
         low, size = np.zeros((2, len(slots), 2), int)
         self.lit, runs = np.zeros((len(slots), 4), int), []
-        for run in self.aim.runs(slots):
+        for run in self.aim.runs(slots, level):
             part = slice(run.first, run.last)
             low[part], self.lit[part] = run.low, run.lit_window
             if run.renderer is not None:
