@@ -231,7 +231,8 @@ def _transform(psf, bands, center, nu_y, nu_x, matrix):
     """`otf` of some bands, all centred at `center`, without the band's edge: (bands, Ky, Kx)."""
     images = psf.images[bands]
     # smaller images of some bands have zeros around them
-    (y1, y2), (x1, x2) = (_lit(np.any(images, axis=(0, axis)), 0) for axis in (2, 1))
+    lit = images.any(axis=0)
+    (y1, y2), (x1, x2) = (_lit(lit.any(axis=axis), 0) for axis in (1, 0))
     images, y0, x0 = images[:, y1:y2, x1:x2], center[0] - y1, center[1] - x1
     n_y, n_x = images.shape[1:]
     (a, b), (c, d) = matrix * psf.spacing
