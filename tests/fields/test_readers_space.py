@@ -19,7 +19,7 @@ from helpers.survey_files import (
     write_i2d,
 )
 
-from clresample import PSF, FieldOptions, Grid, read_hst, read_jwst, run_field
+from clresample import PSF, FieldOptions, Grid, read_hst, read_jwst, run_field, simulate_field
 from clresample.sky.box import Box
 from clresample.sky.wcs_interface import Ape14Wcs
 
@@ -154,7 +154,11 @@ def test_the_gwcs_places_the_pixels(tmp_path):
     assert any("its gwcs cannot be read" in note for note in notes)
 
 
-def test_a_field_behind_the_interface_is_that_on_the_wcs(sky, tmp_path):
+def test_a_field_behind_the_interface_is_that_on_the_wcs(tmp_path):
+    pytest.importorskip("galsim")
+    pytest.importorskip("sep")
+    given = {"rubin_bands": ("i",), "psf_variation": 0.1, "bad_columns": 1}
+    sky = simulate_field(11, n_pixels=128, density=160, clustering=0.5, **given)
     mosaics = mosaics_of(sky)[:1]
     place = SlicedLowLevelWCS(mosaics[0].grid.wcs, Ellipsis)
     behind = (replace(mosaics[0], grid=Grid.from_wcs(place, mosaics[0].grid.shape)),)
@@ -170,4 +174,4 @@ def test_a_field_behind_the_interface_is_that_on_the_wcs(sky, tmp_path):
         assert np.abs((own[key] - other[key]).to_value("arcsec")).max() < 1e-3
     model = fits.getheader(tmp_path / "behind" / "model_Euclid.fits")
     there = Grid.from_wcs(WCS(model), mosaics[0].grid.shape)
-    assert np.abs(there.positions_in(mosaics[0].grid, 9.0, 150.0) - [9, 150]).max() < 1e-3
+    assert np.abs(there.positions_in(mosaics[0].grid, 9.0, 110.0) - [9, 110]).max() < 1e-3

@@ -4,6 +4,7 @@ import os
 import signal
 import time
 import weakref
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,6 +25,27 @@ def work(folder, task):
     if task == "hang":
         time.sleep(600)
     return task.upper()
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Context of tasks in three steps, of which each leaves a file."""
+
+    folder: str
+    device: object = None
+
+
+def nothing(context, task):
+    """Inputs of a task that needs none."""
+
+
+def act(context, task, given):
+    """`work`, and the content of its file."""
+    return work(context.folder, task), task.encode()
+
+
+def path_of(context, task):
+    return Path(context.folder) / f"{task}.txt"
 
 
 def whose(folder, task):

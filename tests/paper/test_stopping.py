@@ -1,5 +1,6 @@
 """When a fit ends, and with which state: convergence, divergence, Ctrl-C."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -107,10 +108,16 @@ def interrupt_call(monkeypatch, where, when):
     monkeypatch.setattr(Engine, where, method)
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(device):
+    """Fits without Ctrl-C by their settings, each run once."""
+    return functools.cache(lambda settings: fit(blend(BRIGHT), device, settings=settings))
+
+
 @pytest.mark.parametrize("sizes", [StepSizes(), StepSizes(latent=0.002, spectrum=0.02)])
 @pytest.mark.parametrize("when", [0, 3, 12])
 @pytest.mark.parametrize("where", ["gradient", "step"])
-def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
+def test_ctrl_c_gives_the_best_state(device, monkeypatch, uninterrupted, where, when, sizes):
     """However far an iteration has come, and be the state half-way through it a better one."""
     interrupt_call(monkeypatch, where, when)
     settings = PaperSettings(prior=SingleScalePrior(), max_iter=60, rel_tol=0, step_sizes=sizes)
@@ -118,7 +125,7 @@ def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
     assert result.status == "interrupted" and not result.converged
     monkeypatch.undo()
     done = when // CHECK_ITERATIONS * CHECK_ITERATIONS
-    whole = fit(blend(BRIGHT), device, settings=replace(settings, max_iter=max(done, 1)))
+    whole = uninterrupted(replace(settings, max_iter=max(done, 1)))
     if when or where == "step":
         best = whole.losses[: done + 1 : CHECK_ITERATIONS].min()
         assert result.losses[-1] == pytest.approx(best, rel=1e-6)

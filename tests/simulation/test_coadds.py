@@ -1,5 +1,7 @@
 """Scenes on mosaics: the same light, noise as stated, errors of fits that hold only where told."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,12 @@ SCENE = simulate_scene(5)
 def model(image):
     """All the scene's light (C, Ny, Nx) [counts] on Euclid's pixels, as a perfect model has it."""
     return np.einsum("sc,syx->cyx", image.counts, SCENE.euclid.truth)
+
+
+@functools.cache
+def mosaics(kind):
+    """The scene on both instruments' mosaics."""
+    return mosaic_scene(SCENE, np.random.default_rng(1), kind=kind)
 
 
 def residual(image, observation):
@@ -35,7 +43,7 @@ def residual(image, observation):
 @pytest.mark.parametrize("kind", ["lanczos", "drizzle"])
 @pytest.mark.parametrize("name", ["euclid", "rubin"])
 def test_a_mosaic_is_the_scene_with_the_stated_noise(kind, name):
-    image = getattr(mosaic_scene(SCENE, np.random.default_rng(1), kind=kind), name)
+    image = getattr(mosaics(kind), name)
     observation = image.observation()
     away, inside = residual(image, observation)
     assert observation.shape[1] > 1.4 * image.data.shape[1]
@@ -51,7 +59,7 @@ def test_a_mosaic_is_the_scene_with_the_stated_noise(kind, name):
 
 @pytest.mark.parametrize("kind", ["lanczos", "drizzle"])
 def test_an_estimate_from_a_blends_sky_finds_it(kind):
-    image = mosaic_scene(SCENE, np.random.default_rng(2), kind=kind).euclid
+    image = mosaics(kind).euclid
     observation = image.observation()
     found = NoiseCorrelation.estimate(observation.data[0], observation.weights[0])
     stated = observation.noise[0].error_factor(2.0)
