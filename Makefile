@@ -9,6 +9,9 @@ RUN = $(VENV)/bin/python -m
 # by numbers of tests the long files of few tests, such as tests/fields/test_kills.py, come last.
 PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
+# Processes of tests, and those that these start, read each other's compiled modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
     test-as-gpu test-install test-oldest test-adapters threads docs kills \
     kernel-tests gpu-builds gpu-model
