@@ -22,7 +22,7 @@ import numpy as np
 
 from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
-from .levels import level_of
+from .levels import deficit_of, level_of
 
 # [arcsec] Standard deviations of G: for points, for galaxies of typical size in deep images (half
 # of their light within 0.25 arcsec) and for large faint ones. A galaxy between two of them loses
@@ -102,9 +102,10 @@ class SignalToNoise:
         return np.where(inside, self.channels[:, places[:, 0], places[:, 1]], 0).T
 
 
-def signal_of(observation, frame, places=None) -> SignalToNoise:
+def signal_of(observation, frame, places=None, *, deficits=True) -> SignalToNoise:
     """The SignalToNoise of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
 
+    deficits: without the levels of skies of which too much was subtracted, see levels.py
     places (Ny, Nx, 2) [px]: of the frame's pixels on the observation; None = by their grids
     """
     from scipy import fft
@@ -139,6 +140,10 @@ def signal_of(observation, frame, places=None) -> SignalToNoise:
             some = variance > NO_WEIGHT * most
             images = fft.irfft2(light * kernel.conj(), size)[inside]
             images = np.where(some, images / np.sqrt(np.where(some, variance, 1)), 0)
+            if deficits:
+                areas = np.abs(kernel[:, 0, 0]) ** 2 / power[:, 0, 0].real
+                for image, own, area in zip(images, some, areas, strict=True):
+                    image[own] -= np.broadcast_to(deficit_of(image, own, area), own.shape)[own]
             for image in images:  # added one by one, whatever the step
                 totals[0, w] += image
                 totals[1, w] += np.maximum(image, 0) ** 2
