@@ -31,6 +31,7 @@ import numpy as np
 from scipy import ndimage
 
 from .hills import root, saddles, watershed
+from .peaks import POINT_AREA
 
 # [FWHM^2] area of a body's highest isophote, FWHM of the PSF: a star reaches it at 1e-3 of its peak
 BODY_AREA = 100.0
@@ -70,8 +71,6 @@ OUTLINE = 0.1
 CENTER_LIGHT = 0.5
 # [1] width of the Gaussian under which the centre is sought, in radii of the highest isophote
 CENTER_WIDTH = 0.7
-# [FWHM^2] sum of a point source's image filtered with its PSF, over its peak: 4 pi sigma^2
-POINT_AREA = 2.27
 
 
 @dataclass(frozen=True, eq=False)

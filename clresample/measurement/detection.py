@@ -251,7 +251,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
     sep = import_sep()
     at = places or [None] * len(observations)
-    signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
+    pairs = zip(observations, at, strict=True)
+    signals = [signal_of(o, frame, one, deficits=beside) for o, one in pairs]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
     scale = frame.grid.pixel_scale_arcsec
@@ -323,6 +324,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
         rest / noise,
         max(threshold, MIN_PEAK_SIGMA),
         MIN_AREA_BESIDE * fwhm**2,
+        fwhm,
         list(places),
         SAME_SOURCE * fwhm,
         own=False,

@@ -6,12 +6,20 @@ Source: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
+
+from .hills import root, saddles, watershed
 
 # sep's deblending: number of levels of equal ratio between threshold and peak, and the smallest
 # fraction of an object's light in a branch that becomes an object. With SExtractor's 32 levels and
-# 0.005, neighbours of bright galaxies are lost, because their branches span few levels. With less
-# than 0.001, clumps of large galaxies become objects.
-N_LEVELS, MIN_CONTRAST = 256, 0.001
+# 0.005, neighbours of bright galaxies are lost, because their branches span few levels.
+N_LEVELS, MIN_CONTRAST = 256, 1e-6
+# [1] Smallest light of an object above its saddle, in that of all connected pixels: clumps of large
+# galaxies have less. In a crowd so have sources of signal to noise up to 900, so that there the
+# brightest object's light counts, if that has at most COMPACT areas of a point source.
+MIN_PART, COMPACT = 0.001, 3.0
+# [FWHM^2] sum of a point source's image filtered with its PSF, over its peak: 4 pi sigma^2
+POINT_AREA = 2.27
 # How often sep's limits are doubled: to 32 times an image's pixels in its buffer, and to 32,768
 # branches of one object, some 100 bytes for each of both
 DOUBLINGS = 5
@@ -25,15 +33,15 @@ def import_sep():
     return sep
 
 
-def new_peaks(sep, image, threshold, area, known, apart, own=True):
+def new_peaks(sep, image, threshold, area, fwhm, known, apart, *, own=True):
     """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first.
 
-    area [px]: smallest area of an object
+    area [px]: smallest area of an object; fwhm [px]: of the PSF
     known: positions (2,) of sources; objects whose peak is within `apart` [px] of one are left out
     own: also leave out objects that contain a known source: under a wide filter a pair of sources
         is one object with its peak between them
     """
-    objects, segments = _objects(sep, image, threshold, area)
+    objects, segments = _objects(sep, image, threshold, area, fwhm)
     places = np.array(known).reshape(-1, 2)
     at = np.clip(np.rint(places).astype(int), 0, np.array(image.shape) - 1)
     taken = set(segments[at[:, 0], at[:, 1]].tolist()) if own else set()
@@ -45,7 +53,7 @@ def new_peaks(sep, image, threshold, area, known, apart, own=True):
     return sorted(found, key=lambda one: -one[1])
 
 
-def _objects(sep, image, threshold, area):
+def _objects(sep, image, threshold, area, fwhm):
     """sep's objects: (position (y, x), height) of each, and their numbers in pixels (Ny, Nx).
 
     From 1, 0 = none.
@@ -65,9 +73,56 @@ def _objects(sep, image, threshold, area):
             segmentation_map=True,
         ),
     )
-    return [
-        (np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects
-    ], segments
+    peaks = [(np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects]
+    return _without_structure(image, threshold, POINT_AREA * fwhm**2, peaks, segments)
+
+
+def _without_structure(image, threshold, point_area, peaks, segments):
+    """Objects and their numbers, see `_objects`, without faint ones on the light of brighter ones.
+
+    The pixels of those are in no object.
+
+    point_area [px]: a point source's light over its peak
+    """
+    if len(peaks) < 2:
+        return peaks, segments
+    inside = image > threshold
+    at = np.array([place for place, _ in peaks], int).reshape(-1, 2)
+    of, n = ndimage.label(inside, np.ones((3, 3)))
+    number = np.arange(len(peaks) + 1)
+    own = of[at[:, 0], at[:, 1]]
+    height = np.array([peak for _, peak in peaks])
+    base = np.maximum(_saddle_heights(image, inside, at, height), threshold)
+    above = image - np.concatenate([[0], base])[segments]
+    light = ndimage.sum_labels(np.maximum(above, 0), segments, number)[1:]
+    number_of = np.arange(1, n + 1)
+    top = np.array(ndimage.maximum_position(light, own, number_of), int)[own - 1, 0]
+    compact = light[top] < COMPACT * point_area * height[top]
+    whole = np.where(compact, light[top], ndimage.sum_labels(image, of, number_of)[own - 1])
+    kept = light >= MIN_PART * whole
+    if kept.all():
+        return peaks, segments
+    number[1:] = np.where(kept, np.cumsum(kept), 0)
+    return [peaks[i] for i in np.flatnonzero(kept)], number.astype(segments.dtype)[segments]
+
+
+def _saddle_heights(image, inside, at, height):
+    """Light (S,) of the highest saddle between each of the peaks at (S, 2) and a higher one.
+
+    Their heights where they are no local maxima.
+    """
+    basins = watershed(image, inside, at)
+    own = basins[at[:, 0], at[:, 1]] - 1
+    found, parent = height.copy(), np.arange(basins.max())
+    top, rising = np.zeros(len(parent), int), np.argsort(height)
+    top[own[rising]] = rising
+    found[top[own]] = 0
+    for (a, b), light in zip(*saddles(image, basins, heights=True), strict=True):
+        a, b = root(parent, a), root(parent, b)
+        if a != b:
+            low, high = sorted((a, b), key=lambda k: height[top[k]])
+            found[top[low]], parent[low] = light, high
+    return found
 
 
 def _with_room(sep, n_pixels, extract):

@@ -262,7 +262,7 @@ def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
 def test_companions_have_five_sigma_however_low_the_threshold(monkeypatch):
     given = []
 
-    def searched(_sep, _image, threshold, area, known, apart, own):
+    def searched(_sep, _image, threshold, area, _fwhm, known, apart, own):
         given.append((threshold, area, len(known), apart, own))
         return []
 

@@ -155,3 +155,22 @@ def test_without_sep_it_says_what_to_install(monkeypatch):
     observations, frame = instruments([])
     with pytest.raises(ImportError, match="pip install sep"):
         detect(observations, frame)
+
+
+def test_sources_of_a_crowd_do_not_hide_one_another():
+    """All are connected; one of a thousandth of their light, clear of others, is a source."""
+    rng = np.random.default_rng(1)
+    bright = [(y, x, 6e4) for y in (12, 28) for x in (10, 26, 42, 58, 74)]
+    faint = [(52, x, 700.0) for x in (10, 26, 42, 58, 74)]
+    data, grid = rng.normal(size=SHARP.shape), SHARP
+    y, x = np.indices(data.shape)
+    for y0, x0, flux in bright + faint:
+        light = (1 + ((y - y0) ** 2 + (x - x0) ** 2) / 9) ** -2.5
+        data += flux * light / light.sum()
+    n = np.arange(41) - 20.0
+    psf = PSF((1 + (n[:, None] ** 2 + n**2) / 9) ** -2.5)
+    found = detect([Observation(data, psf, grid, weights=1.0)])
+    assert (found.image > 5).all(axis=1)[10:50].any()
+    places = np.array([source.position_px for source in found.sources])
+    away = [np.hypot(*(places - [y0, x0]).T).min() for y0, x0, _ in bright + faint]
+    assert max(away) < 2 and len(places) == 15

@@ -126,7 +126,7 @@ def test_an_object_has_as_many_pixels_as_it_has_to(area, n):
 
     image = np.zeros((20, 20), np.float32)
     image[10, 12] = 9
-    found = peaks.new_peaks(sep, image, 5.0, area, [], 1.0)
+    found = peaks.new_peaks(sep, image, 5.0, area, 3.0, [], 1.0)
     assert [(tuple(place), peak) for place, peak in found] == [((10, 12), 9)][:n]
 
 
@@ -136,7 +136,7 @@ def test_the_brightest_peak_comes_first():
     image = np.zeros((30, 30), np.float32)
     for place, peak in (((5, 5), 9), ((20, 8), 30), ((12, 24), 15)):
         image[place] = peak
-    assert [peak for _, peak in peaks.new_peaks(sep, image, 5.0, 1, [], 1.0)] == [30, 15, 9]
+    assert [peak for _, peak in peaks.new_peaks(sep, image, 5.0, 1, 3.0, [], 1.0)] == [30, 15, 9]
 
 
 def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
@@ -148,8 +148,8 @@ def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
 
     image = np.zeros((9, 12), np.float32)
     image[4, 5:8] = 5.0
-    objects, segments = peaks._objects(NotAsked(), image, 5.0, 1)
+    objects, segments = peaks._objects(NotAsked(), image, 5.0, 1, 3.0)
     assert objects == [] and segments.shape == image.shape and not segments.any()
     image[4, 6] = np.float32(5.0001)
-    (found,), segments = peaks._objects(sep, image, 5.0, 1)
+    (found,), segments = peaks._objects(sep, image, 5.0, 1, 3.0)
     assert found[0].tolist() == [4, 6] and segments.sum() == 1

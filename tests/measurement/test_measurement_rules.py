@@ -102,7 +102,7 @@ def test_objects_have_a_quarter_of_the_square_of_their_images_fwhm(monkeypatch):
     pytest.importorskip("sep")
     given = []
 
-    def searched(_sep, _image, threshold, area, _known, apart, own=True):
+    def searched(_sep, _image, threshold, area, _fwhm, _known, apart, own=True):
         given.append((threshold, area, apart))
         return []
 
@@ -162,7 +162,7 @@ def test_what_an_object_is_and_what_a_known_source_hides():
         image[place] = peak
 
     def found(known, apart=0.0, own=True, area=1):
-        new = peaks.new_peaks(sep, image, 5.0, area, known, apart, own)
+        new = peaks.new_peaks(sep, image, 5.0, area, 3.0, known, apart, own=own)
         return [tuple(map(int, place)) for place, _ in new]
 
     assert found([]) == [(5, 30), (5, 5), (20, 10)]
@@ -189,6 +189,6 @@ def test_a_faint_neighbour_of_a_bright_object_is_an_object_of_its_own():
     bright = spot((30, 20), 3000, 5)
     for height, n in ((100.0, 2), (9.0, 1)):
         image = (bright + spot((30, 41), height, 1.8)).astype(np.float32)
-        objects, segments = peaks._objects(sep, image, 5.0, 3)
+        objects, segments = peaks._objects(sep, image, 5.0, 3, 4.0)
         assert len(objects) == n == segments.max()
         assert tuple(objects[0][0]) == (30, 20) or tuple(objects[-1][0]) == (30, 20)
