@@ -120,7 +120,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
     observation: one; frame: Frame that it is searched in
     """
-    return signal_of(observation, frame).scatters()
+    return signal_of(without_filled([observation])[0][0], frame).scatters()
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:

@@ -1,4 +1,4 @@
-"""Finds pixels without data that are filled with a number: zeros beyond an edge or in chip gaps.
+"""Finds pixels without data, filled with a number: zeros beyond an edge or in chip gaps.
 
 Noise of floating-point numbers gives no value to many neighbouring pixels. So large blocks of one
 exact value in such noise are no data. Images of integers or of other steps, and images without
