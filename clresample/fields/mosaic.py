@@ -307,7 +307,7 @@ def filled_pixels_of(image, weights) -> np.ndarray:
     values = image[usable]
     if values.size and (values == values[0]).all():
         return usable
-    filled = filled_pixels(image, usable)
+    filled = filled_pixels(image, usable, weights)
     return filled & ~(np.where(filled, image, 0) * np.sqrt(weights) > FLAT_SIGMAS)
 
 

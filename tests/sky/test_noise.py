@@ -146,3 +146,12 @@ def test_filled_pixels_of_white_and_smoothed_noise(fwhm):
 def test_images_with_equal_pixels_that_are_data(make):
     image = make(galaxy((200, 200))).astype(float)
     assert not filled_pixels(image, np.ones(image.shape, bool)).any()
+
+
+def test_rounding_errors_of_a_model_are_no_noise():
+    image = galaxy((200, 200)) / 1e3 + noise((200, 200), 1e-8)
+    image[:, :20] = 0
+    usable, weights = np.ones(image.shape, bool), np.full(image.shape, 1e8)
+    assert not filled_pixels(np.where(image > 1e-6, 0, image), usable, weights).any()
+    image += np.where(image == 0, 0, noise((200, 200), 1e-4))
+    np.testing.assert_array_equal(filled_pixels(image, usable, weights), image == 0)

@@ -21,17 +21,18 @@ def without_filled(observations) -> tuple[tuple, list[list[str]]]:
     observations, constant, noisy = tuple(observations), {}, False
     filled = [np.zeros(o.data.shape, bool) for o in observations]
     for i, o in enumerate(observations):
-        for c, (image, usable) in enumerate(zip(o.data, o.weights > 0, strict=True)):
+        for c, (image, weights) in enumerate(zip(o.data, o.weights, strict=True)):
+            usable = weights > 0
             values = image[usable]
             if values.size and (values == values[0]).all():
                 constant[i, c] = usable
             else:
-                filled[i][c] = filled_pixels(image, usable)
+                filled[i][c] = filled_pixels(image, usable, weights)
     if constant:
         noisy = any(
-            (i, c) not in constant and is_noise(image, (o.weights[c] > 0) & ~filled[i][c])
+            (i, c) not in constant and is_noise(image, (w > 0) & ~filled[i][c], w)
             for i, o in enumerate(observations)
-            for c, image in enumerate(o.data)
+            for c, (image, w) in enumerate(zip(o.data, o.weights, strict=True))
         )
     if noisy:
         for (i, c), usable in constant.items():
