@@ -15,15 +15,15 @@ MIN_BLOCK = 8
 MAX_VALUES = 16
 # Number of pixels whose values are compared, and the smallest one.
 SAMPLE, MIN_SAMPLE = 2000, 32
-# [1] Largest fraction of them that share their value with others. It is 0.0001 for noise in
-# float32, 0.2 where the noise is less than 1e-4 of the sky, and near 1 in steps of a tenth of it.
+# [1] Largest fraction of them that share their value with others. It is 0 for noise in
+# float32, 0.02 and 0.22 on a sky of 1e3 and 1e4 sigma, and 0.97 in steps of a tenth of the noise.
 MAX_SHARED = 0.05
 # [1] Smallest fraction of pixels that are brighter or fainter than both neighbours of their row: in
 # white noise it is 2/3, in noise smoothed with a FWHM of 4 px 0.22. On bright galaxies it is less;
-# in models without noise it is 0.05.
+# in a model of three sources without noise it is 0.04.
 MIN_EXTREMES = 0.1
-# [sigma] Smallest median difference of neighbours where weights are known: 0.95 in white noise,
-# 0.27 in noise smoothed with a FWHM of 4 px, under 0.01 in rounding errors of models.
+# [sigma] Smallest median difference of neighbours where weights are known: 0.96 in white noise,
+# 0.27 in noise smoothed with a FWHM of 4 px. Rounding errors of models are far below it.
 MIN_STEP = 0.05
 
 
