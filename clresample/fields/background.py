@@ -56,12 +56,13 @@ def find_background(read, good, shape) -> Background:
     shape (Ny, Nx) [px]
 
     The level of a cell is that of `sky.noise.background`, with sources clipped. Cells with fewer
-    than 32 valid pixels get the level of their neighbours. Then each level is replaced by the
-    median of 3 x 3 cells, which removes cells dominated by a bright galaxy.
+    than 32 valid pixels, and those filled with one value, get the level of their neighbours. Then
+    each level is replaced by the median of 3 x 3 cells, which removes cells dominated by a bright
+    galaxy.
     """
     edges = cell_edges(shape, CELL_PX)
     counts = [len(part) - 1 for part in edges]
-    levels = np.full(counts, np.nan)
+    levels, scatters = np.full(counts, np.nan), np.zeros(counts)
     for i in range(counts[0]):
         strip = Box(int(edges[0][i]), 0, int(edges[0][i + 1]), shape[1])
         pixels, usable = read(strip), good(strip)
@@ -69,10 +70,12 @@ def find_background(read, good, shape) -> Background:
             columns = slice(edges[1][j], edges[1][j + 1])
             cell = pixels[:, columns][usable[:, columns]]
             if np.isfinite(cell).sum() >= MIN_PIXELS:
-                levels[i, j] = background(cell)[0]
+                levels[i, j], scatters[i, j] = background(cell)
     if np.isnan(levels).all():
         raise ValueError("background: no cell of the image has 32 good pixels")
     empty = np.isnan(levels)
+    if scatters.any():
+        empty |= scatters == 0
     _, nearest = ndimage.distance_transform_edt(empty, return_indices=True)
     levels = ndimage.median_filter(levels[tuple(nearest)], 3, mode="nearest")
     return Background(levels, tuple(n / k for n, k in zip(shape, counts, strict=True)))

@@ -8,7 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from ..deblending.inspection.spoilt import FLAT_SIGMAS
 from ..sky.box import Box, outline
+from ..sky.filled import filled_pixels
 from ..sky.grid import Grid, as_grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
@@ -250,7 +252,14 @@ class Mosaic:
             weights[:, ignore] = 0
         if not weights.any():
             return None
-        data = np.stack([c.read(box) for c in self.channels])
+        data = np.stack([np.asarray(c.data.read(box), np.float64) for c in self.channels])
+        for c, image, w in zip(self.channels, data, weights, strict=True):
+            if subtract is not None or isinstance(c.background, Background):
+                w[filled_pixels_of(image, w)] = 0  # not of one value afterwards
+            if c.background is not None:
+                image -= c.background.read(box)
+        if not weights.any():
+            return None
         if subtract is not None:
             data = data - subtract
         if extra is not None:
@@ -287,6 +296,19 @@ def saturations(channels, box) -> np.ndarray | None:
     if all(c.saturation is None for c in channels):
         return None
     return np.array([c.saturation_of(box) for c in channels])
+
+
+def filled_pixels_of(image, weights) -> np.ndarray:
+    """Pixels (Ny, Nx) bool of a plane that are filled with a value: no data.
+
+    An image of one value is filled; flat tops of saturated stars are not, see `FLAT_SIGMAS`.
+    """
+    usable = (weights > 0) & np.isfinite(image)
+    values = image[usable]
+    if values.size and (values == values[0]).all():
+        return usable
+    filled = filled_pixels(image, usable, weights)
+    return filled & ~(np.where(filled, image, 0) * np.sqrt(weights) > FLAT_SIGMAS)
 
 
 def _set(flags, bits):

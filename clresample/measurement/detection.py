@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..deblending.inspection.filled import without_filled
 from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.linear.spectra import MODEL_ERROR
@@ -108,7 +109,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     """
     observations = as_observations(observations)
     frame = model_frame(observations) if frame is None else frame
-    return _search(without_rays(observations, frame), frame, threshold, [], scatters)
+    observations = without_rays(without_filled(observations)[0], frame)
+    return _search(observations, frame, threshold, [], scatters)
 
 
 def noise_scatter(observation, frame) -> np.ndarray:
@@ -118,7 +120,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
     observation: one; frame: Frame that it is searched in
     """
-    return signal_of(observation, frame).scatters()
+    return signal_of(without_filled([observation])[0][0], frame).scatters()
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:

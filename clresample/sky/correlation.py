@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, convolve, gaussian_filter
 
+from .filled import filled_pixels
 from .psf import PSF
 from .validation.checks import ReadOnly, as_float_array
 
@@ -119,9 +120,11 @@ class NoiseCorrelation(ReadOnly):
         """Estimates it from the blank sky of an image (Ny, Nx) with weights (Ny, Nx).
 
         Blank are pixels under 3.5 sigma in a smoothed image, 5 pixels away from those above it.
+        Pixels without data that are filled with a value are left out (`filled_pixels`).
         Raises ValueError where too little sky is left.
         """
-        seen = weights > 0
+        image, seen = np.asarray(image), np.asarray(weights) > 0
+        seen &= ~filled_pixels(image, seen)
         noise = np.where(seen, image, 0) * np.sqrt(weights)
         blank = seen & ~_lit(noise, seen)
         noise = np.where(blank, noise - (noise[blank].mean() if blank.any() else 0), 0)

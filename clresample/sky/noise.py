@@ -8,6 +8,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from .filled import filled_pixels
 from .validation.checks import as_float_array, mask_of, split_mask, to_unit
 
 
@@ -46,7 +47,8 @@ def background(image, mask=None) -> tuple[float, float]:
     third if they cover half, and by 30 to 50 % on a 48 x 58 cutout of a real blend. For correlated
     noise it is the scatter of single pixels. It is 0 if more than half of the pixels are equal.
 
-    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
+    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too, and so
+        are pixels without data that are filled with a value (`filled_pixels`)
 
     The MAD of a quantised image, such as one of integers, would be quantised too. So equal values
     are first spread evenly over their step.
@@ -86,18 +88,21 @@ def _spread_steps(values):
 def noise_sigma(image, mask=None) -> float:
     """Scatter of an image's background by `background`; an error if it is not reliable.
 
-    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
-    Raises ValueError for fewer than 32 pixels, and where more than half of them have one value.
+    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN, infinite and filled pixels are ignored too
+    Raises ValueError for fewer than 32 pixels, and where most of those near the level have one
+    value.
     """
-    n_usable = _usable(image, mask).size
+    values = _usable(image, mask)
+    n_usable = values.size
     if n_usable < MIN_PIXELS:
         raise ValueError(
             f"{n_usable} pixels are left to estimate the noise from, {MIN_PIXELS} are needed"
         )
-    _, sigma = background(image, mask)
+    level, sigma = background(image, mask)
     if not sigma > 0:
         raise ValueError(
-            "more than half of the pixels have the same value: no noise can be estimated from them"
+            f"{np.count_nonzero(values == level)} of {n_usable} pixels have the same value, "
+            f"{level:.6g}, and few others are near it: no noise can be estimated from them"
         )
     return sigma
 
@@ -118,12 +123,12 @@ def sigma_below_zero(image) -> float | None:
 
 
 def _usable(image, mask):
-    """The pixels (n,) float64 of an image that are finite and not masked."""
+    """The pixels (n,) float64 of an image that are finite, not masked and not filled."""
     image = np.asarray(image, dtype=np.float64)
     good = np.isfinite(image)
     if mask is not None:
         good &= ~np.asarray(mask, dtype=bool)
-    return image[good]
+    return image[good & ~filled_pixels(image, good)]
 
 
 def weights_from(data, bad, given, mask, channels, unit=None):

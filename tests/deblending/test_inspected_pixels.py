@@ -195,3 +195,43 @@ def test_values_at_the_saturation_are_masked():
     object.__setattr__(o, "saturation", np.array([np.nan, 100.0]))
     full = spoilt.saturated(looked_at(o))
     assert not full[0].any() and full[1][o.data[1] >= 100].all()
+
+
+@pytest.mark.parametrize("value", [0.0, -100.0])
+def test_pixels_filled_with_a_value_are_masked(value):
+    """In one channel without data in half of the frame, or in four columns through a galaxy."""
+    for region in (np.s_[1, :32], np.s_[1, :, 17:21]):
+        data = image_of()
+        data[region] = value
+        filled = np.zeros(data.shape, bool)
+        filled[region] = True
+        found = inspected([observed(data)])
+        (message,) = found.messages
+        at = tuple(np.argwhere(filled)[0, 1:].tolist())
+        assert f"channel r has {filled.sum()} pixels of exactly {value:g}, the first at" in message
+        assert f"(y, x) = {at}" in message
+        np.testing.assert_array_equal(found.blend.observations[0].weights == 0, filled)
+
+
+def test_a_channel_of_one_value_beside_noise_is_masked():
+    data = image_of()
+    empty = observed(np.zeros((1, *SHAPE)), channels=("i",), name="other")
+    found = inspected([observed(data), empty])
+    assert "other: channel i has 3840 pixels of exactly 0" in found.messages[0]
+    assert (found.blend.observations[1].weights == 0).all()
+    assert (found.blend.observations[0].weights > 0).all()
+    light = observed(image_of(noise=0))
+    same = inspected([light, empty]).blend.observations
+    assert same == (light, empty)  # no noise
+
+
+def test_flat_tops_are_saturated_not_filled():
+    data = np.minimum(image_of(), 60.0)
+    alone = inspected([observed(data)]).blend.observations[0].weights
+    data[:, :, 50:] = 0
+    found = inspected([observed(data)])
+    assert sum("is saturated" in m for m in found.messages) == 2
+    assert sum("640 pixels of exactly 0, the first" in m for m in found.messages) == 2
+    weights = found.blend.observations[0].weights
+    np.testing.assert_array_equal(weights[:, :, :50], alone[:, :, :50])
+    assert not weights[:, :, 50:].any()

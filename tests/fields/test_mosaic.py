@@ -5,6 +5,7 @@ import pytest
 from astropy.io import fits
 
 from clresample import PSF, FunctionPSF, Grid
+from clresample.fields.background import Background
 from clresample.fields.mosaic import ArrayPlane, Channel, ConstantPlane, FilePlane, Mosaic
 from clresample.files.atomic import FileError
 from clresample.sky.box import Box, round_up_size
@@ -137,3 +138,25 @@ def test_boxes():
         43,
     )
     assert a.contains([(-0.5, 0), (9.5, 0), (9.49, 19.4)]).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("changed", ["surface", "light"])
+def test_filled_pixels_get_no_weight_where_subtraction_changes_their_value(image, changed):
+    image[:, 60:] = 0
+    image[10:13, 10:13] = 40  # a flat top stays
+    slope = Background(np.arange(4.0).reshape(2, 2), (30.0, 45.0))
+    background = slope if changed == "surface" else None
+    mosaic = Mosaic("r", grid(), (channel(image, background=background),), PSF.gaussian(1.5))
+    light = np.full((1, *SHAPE), 0.5) if changed == "light" else None
+    found = mosaic.observation(subtract=light)
+    np.testing.assert_array_equal(found.weights[0] == 0, image == 0)
+    subtracted = 0.5 if changed == "light" else slope.read(Box.of(SHAPE))
+    np.testing.assert_allclose(found.data[0], image - subtracted)
+    assert (
+        mosaic.observation(
+            Box(0, 61, 30, 90), subtract=None if light is None else light[:, :30, 61:]
+        )
+        is None
+    )
+    plain = Mosaic("r", grid(), (channel(image),), PSF.gaussian(1.5))
+    assert plain.observation().weights.all()  # the inspection names and masks them

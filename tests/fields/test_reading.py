@@ -11,10 +11,11 @@ from clresample import PSF, Grid
 from clresample.cli import main
 from clresample.fields.background import find_background
 from clresample.fields.execution.folder import open_folder
+from clresample.fields.field_toml.estimates import estimate_weights
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.field_toml.headers import mask_value, zero_point
 from clresample.fields.field_toml.keys import parse_field
-from clresample.fields.mosaic import Mosaic
+from clresample.fields.mosaic import ArrayPlane, Channel, Mosaic
 from clresample.fields.options import FieldOptions, RunProgress
 from clresample.fields.sky_level import (
     find_sky,
@@ -94,6 +95,20 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
     sky = find_background(lambda box: image[box.slices], everywhere, image.shape)
     level = sky.read(Box(200, 200, 300, 300))
     assert abs(level - 7).max() < 0.3
+
+
+def test_backgrounds_and_noise_leave_out_filled_pixels():
+    image = np.random.default_rng(3).normal(50, 2, (512, 512)) + np.arange(512) / 50
+    image[:, :300] = 0  # two columns of cells, and a part of the third
+    everywhere = lambda box: np.ones(box.shape, bool)  # noqa: E731
+    sky = find_background(lambda box: image[box.slices], everywhere, image.shape)
+    assert abs(sky.read(Box(0, 320, 512, 500)) - image[:, 320:500]).mean() < 2
+    assert sky.levels.min() > 50
+    channel = Channel("r", ArrayPlane(image), background=sky)
+    mosaic = Mosaic("A", Grid.flat(image.shape, 0.1), (channel,), PSF.gaussian(2.0))
+    notes = []
+    (channel,) = estimate_weights(mosaic, notes).channels
+    assert channel.weight.value**-0.5 == pytest.approx(2, rel=0.05)
 
 
 @pytest.mark.parametrize("level", [0.3, -0.2, 0.03])

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
+from clresample.sky.filled import filled_pixels
 from clresample.sky.noise import background, noise_sigma, sigma_below_zero
 
 # relative error of a MAD from n pixels of Gaussian noise, 1.17 / sqrt(2 n), at 5 sigma
@@ -36,10 +37,21 @@ def test_noise_sigma_hardly_sees_sources(share, bias):
 def test_noise_that_cannot_be_estimated():
     with pytest.raises(ValueError, match="31 pixels are left.*32 are needed"):
         noise_sigma(noise((1, 31)))
-    padded = noise((40, 40))
-    padded[:21] = 0
-    with pytest.raises(ValueError, match="same value"):
-        noise_sigma(padded)
+    whole = np.rint(noise((40, 40), 0.3))
+    n = np.count_nonzero(whole == 0)
+    with pytest.raises(ValueError, match=f"{n} of 1600 pixels have the same value, 0, and few"):
+        noise_sigma(whole)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.45, 0.6])
+@pytest.mark.parametrize("value", [0.0, -99.0, 0.7])
+def test_pixels_filled_with_a_value_are_no_noise(share, value):
+    image = noise((200, 200), 3.0).astype(np.float32)
+    image[: int(200 * share)] = value
+    image[60::10, 100] = value  # single ones
+    level, sigma = background(image)
+    assert sigma == pytest.approx(3, rel=TOLERANCE / 126) and abs(level) < 0.15
+    assert noise_sigma(image) == sigma
 
 
 def test_background_is_level_and_scatter():
@@ -91,6 +103,55 @@ def test_values_that_are_few_are_no_steps():
     assert background(np.zeros((20, 20))) == (0.0, 0.0)
     rng = np.random.default_rng(1)
     filled = rng.normal(0, 1, 400)
-    filled[:90] = 0.0  # among floats
+    filled[::5] = 0.0  # among floats, apart from each other
     apart = filled + 1e-9 * rng.normal(0, 1, 400)
     assert background(filled)[1] == pytest.approx(background(apart)[1], rel=1e-6)
+
+
+def galaxy(shape):
+    y, x = np.indices(shape) - np.array(shape)[:, None, None] / 2
+    return 1e3 * np.exp(-np.hypot(y, x) / 8)
+
+
+@pytest.mark.parametrize("fwhm", [0, 1.5, 4])
+def test_filled_pixels_of_white_and_smoothed_noise(fwhm):
+    """Half of the frame, a dead column, a square and a single pixel of the same value."""
+    from scipy.ndimage import gaussian_filter
+
+    image = gaussian_filter(noise((120, 100), seed=2), fwhm / 2.3548)
+    image += galaxy(image.shape) / 50
+    filled = np.zeros(image.shape, bool)
+    filled[:60, :40] = filled[:, 70] = filled[100:103, 20:23] = filled[90, 90] = True
+    image[filled] = 0
+    usable = np.ones(image.shape, bool)
+    usable[:, 45] = False
+    image[:, 45] = 7  # masked: not searched
+    np.testing.assert_array_equal(filled_pixels(image, usable), filled)
+    np.testing.assert_array_equal(filled_pixels(image[60:80, 50:70], usable[:20, 50:70]), False)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda light: np.random.default_rng(1).poisson(0.1 + light),
+        lambda light: 0.37 * np.random.default_rng(1).poisson(5.0 + light) - 1.8,
+        lambda light: np.rint(4 * (noise(light.shape) + light)) / 4,  # compressed in steps
+        lambda light: np.rint(16 * (noise(light.shape) + light)) / 16,
+        lambda light: np.maximum(noise(light.shape) + light, 0),  # clipped
+        lambda light: np.where(light > 1, light, 0),  # a model in its box
+        lambda light: 0 * light,
+        lambda light: np.minimum(noise(light.shape) + light, 1e9),
+    ],
+)
+def test_images_with_equal_pixels_that_are_data(make):
+    image = make(galaxy((200, 200))).astype(float)
+    assert not filled_pixels(image, np.ones(image.shape, bool)).any()
+
+
+def test_rounding_errors_of_a_model_are_no_noise():
+    image = galaxy((200, 200)) / 1e3 + noise((200, 200), 1e-8)
+    image[:, :20] = 0
+    usable, weights = np.ones(image.shape, bool), np.full(image.shape, 1e8)
+    assert not filled_pixels(np.where(image > 1e-6, 0, image), usable, weights).any()
+    image += np.where(image == 0, 0, noise((200, 200), 1e-4))
+    np.testing.assert_array_equal(filled_pixels(image, usable, weights), image == 0)

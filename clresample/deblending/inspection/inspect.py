@@ -12,6 +12,7 @@ from ..blend import Blend
 from ..settings import AUTO, SMALL, FitSettings
 from . import listing, shifted, spoilt
 from .centroids import centroids
+from .filled import without_filled
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
 from .pixel_noise import noise_lines
@@ -85,7 +86,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     free = not (auto or small) and bool(settings.fit_sky)
     fit_sky = False
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
-    for observation, shift in zip(blend.observations, shifts, strict=True):
+    seen, filled_lines = without_filled(blend.observations)
+    for observation, shift, found_filled in zip(seen, shifts, filled_lines, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
         sky = sky_level(image)
         image = image.over(sky.level)
@@ -105,7 +107,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         expected = sky if free else sky.expected(wrong, dark, part * image.sigma)
         levels.append((sky, expected))
         fit_sky = fit_sky or fitted
-        lines = _unmeasured(image)
+        lines = found_filled + _unmeasured(image)
         if not unknown:
             about = (
                 _unsure_lines(image, sky)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from ...sky.box import Box
 from ...sky.correlation import NoiseCorrelation
+from ...sky.filled import filled_pixels
 from ...sky.noise import noise_sigma
 from ..background import find_background
 from ..mosaic import ConstantPlane
@@ -39,7 +42,11 @@ def estimate_weights(mosaic, notes):
     for c in mosaic.channels:
         if c.weight is None:
             try:
-                sigma = noise_sigma(c.read(box), ~c.valid(box))
+                valid = c.valid(box)
+                if c.background is not None:  # filled pixels are not of one value without it
+                    image = np.asarray(c.data.read(box))
+                    valid &= ~filled_pixels(image, valid & np.isfinite(image))
+                sigma = noise_sigma(c.read(box), ~valid)
             except ValueError as error:
                 raise ValueError(
                     f"channel {c.name}: {error}; give weight, variance or rms"
