@@ -68,9 +68,9 @@ def find_background(read, good, shape) -> Background:
     read: called with a Box, returns its pixels; good: called with a Box, returns its valid pixels
     shape (Ny, Nx) [px]
 
-    The level of a cell is its `clean_level`. Cells with fewer than 32 valid pixels, and those filled
-    with one value, get the level of their neighbours. Then each level is replaced by the median of
-    3 x 3 cells, which removes cells dominated by a bright galaxy.
+    The level of a cell is its `clean_level`. Cells with fewer than 32 valid pixels, and those
+    filled with one value, get the level of their neighbours. Then each level is replaced by the
+    median of 3 x 3 cells, which removes cells dominated by a bright galaxy.
     """
     edges = cell_edges(shape, CELL_PX)
     counts = [len(part) - 1 for part in edges]

@@ -1,4 +1,4 @@
-"""How far the light of each source is rendered: as far as its flux and its own PSF need."""
+"""The light of each source is rendered as far as its flux and its own PSF need."""
 
 from types import SimpleNamespace
 
