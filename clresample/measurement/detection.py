@@ -23,10 +23,12 @@ import numpy as np
 from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.linear.spectra import MODEL_ERROR
+from ..deblending.result import Result
 from ..drawing.display import ShownDetection
 from ..sky.frame import Frame, model_frame
-from ..sky.observation import Observation, as_observations
+from ..sky.observation import Observation, as_observations, check_observations
 from ..sky.sources import ExtendedSource, PointSource, Source
+from ..sky.validation.checks import check_instance
 from .clumps import bodies_of
 from .companions import (
     LEVEL_FWHM,
@@ -107,7 +109,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     Source: see the head of this module.
     """
     observations = as_observations(observations)
-    frame = model_frame(observations) if frame is None else frame
+    check_observations(observations)
+    frame = model_frame(observations) if frame is None else check_instance("frame", frame, Frame)
     return _search(without_rays(observations, frame), frame, threshold, [], scatters)
 
 
@@ -134,6 +137,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
 
     Raises ValueError and ImportError as `detect` does.
     """
+    check_instance("result", result, Result)
     left = []
     for i, o in enumerate(result.observations):
         sky = result.sky[result.channel_slices()[i], None, None]

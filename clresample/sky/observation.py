@@ -13,7 +13,7 @@ from .correlation import NoiseCorrelation, channel_correlations
 from .grid import Grid
 from .noise import weights_from
 from .psf import PSF
-from .validation.checks import ReadOnly, described
+from .validation.checks import ReadOnly, check_sequence, described
 from .validation.containers import arguments_of, is_container
 from .validation.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
 from .validation.observed import (
@@ -244,6 +244,7 @@ def check_observations(observations):
     """
     if not observations:
         raise ValueError("observations is empty, at least one is needed")
+    check_sequence("observations", observations, Observation)
     first = {}
     for observation in observations:
         for channel in observation.channels:

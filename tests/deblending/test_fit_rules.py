@@ -38,12 +38,15 @@ def test_sources_outside_the_frame_are_named():
     home = scenes.frame()
     inside, messages = fit_module._inside(home, np.array([(3.0, 4.0), (30.0, 4.0)]))
     assert inside.tolist() == [True, False] and len(messages) == 1
-    assert messages[0].startswith("source 1 at [30.") and "(30, 36)" in messages[0]
+    assert (
+        messages[0].startswith("a source lies outside the model frame: source 1 at [30.")
+        and "(30, 36)" in messages[0]
+    )
     with pytest.raises(ValueError, match=r"none of the 2 sources lies inside .* \(30, 36\)"):
         fit_module._inside(home, np.array([(-3.0, 4.0), (30.0, 4.0)]))
     assert fit_module._dark_message(3, (1.26, 4.0)) == (
-        "source 3 at (y, x) = (1.3, 4.0) [px] in the model frame lies far from any light: no image "
-        "shows 3 sigma there or beside it"
+        "a source lies far from any light: source 3 at (y, x) = (1.3, 4.0) [px] in the model frame; "
+        "no image shows 3 sigma there or beside it"
     )
 
 
@@ -151,8 +154,6 @@ def test_what_a_failure_says():
     assert batch._failure("b", ValueError("no")) == Failure("b", Ended.FAILED, "no", ValueError)
     assert batch._failure("b", KeyError("no")).reason == "KeyError: 'no'"
     assert not Failure("b", Ended.FAILED).converged
-    with pytest.raises(ValueError, match="blends is 3 .int., must be a sequence"):
-        batch._listed("blends", 3)
     for n, words in ((1, "1 source position"), (2, "2 source positions")):
         with pytest.warns(SourceWarning, match=f"{words} here: see Result"):
             batch._warn_dark([np.arange(n)], " here")
