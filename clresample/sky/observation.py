@@ -63,7 +63,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
     Without weights and variance the noise of each channel is estimated from the scatter of the
     background (`noise_sigma`), as one number without the photon noise of sources, and a
-    NoiseWarning is issued.
+    NoiseWarning is issued, as of images without any usable pixel.
 
     Attributes: data and weights (C, Ny, Nx) float64; psf of C bands, that in the middle of the
     image; psf_field of C bands if the PSF varies, else None; zero_points and noise (C,) or None;
