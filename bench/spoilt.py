@@ -42,7 +42,7 @@ FIRST_CLEAN = 30000
 NAMES = dict.fromkeys((*spoiling.SPOILT, *spoiling.SAMPLED))
 ENOUGH_SIGMA = 3.0
 UNDER_NOISE = "far from any light"  # of messages about sources that no image shows
-DOUBLES = "of each other: no image tells their fluxes apart"  # of messages about close sources
+DOUBLES = "no image tells their fluxes apart"  # of messages about close sources
 COLUMNS = records.columns(
     "scene:10 spoilt:21 moved:7.1f ratio:6.2f own:6.1f neighbour:9.1f n_ratio:7.2f n_own:6.1f "
     "chi2:7.2f status:15 flags:26 named:5 good:5"

@@ -23,7 +23,7 @@ from ..device.tuning import Tuning
 from ..drawing.bar import ProgressBar
 from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
-from ..sky.validation.checks import check_dtype, check_instance, described
+from ..sky.validation.checks import check_dtype, check_instance, check_sequence
 from .blend import Blend, Failure
 from .ended import Ended
 from .fit import Fit, data_bytes, render_fits, scene_bytes, start_fits
@@ -77,7 +77,7 @@ def deblend(
     problems of the observations and of the list of sources (inspection/); the result has them in
     its messages. Ctrl-C ends the fit with the best state so far.
     """
-    blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
+    blend = Blend(as_observations(observations), check_sequence("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
@@ -116,7 +116,7 @@ def deblend_many(
     Issues one SourceWarning for all sources far from any light, and one InputWarning for all
     problems with observations and lists of sources; the results' messages name them.
     """
-    blends = list(blends)
+    blends = check_sequence("blends", blends)
     if progress is True:
         given = {"settings": settings, "device": device, "dtype": dtype, "memory": memory}
         with ProgressBar(len(blends), "blends") as bar:
@@ -285,14 +285,6 @@ def _checked(settings, dtype):
     return check_instance(
         "settings", Settings() if settings is None else settings, FitSettings
     ), check_dtype(dtype)
-
-
-def _listed(name, values):
-    """The values as a tuple. Raises ValueError for one alone."""
-    try:
-        return tuple(values)
-    except TypeError:
-        raise ValueError(f"{name} is {described(values)}, must be a sequence") from None
 
 
 def _result_or_failure(pair):

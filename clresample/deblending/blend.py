@@ -10,7 +10,7 @@ import numpy as np
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
-from ..sky.validation.checks import as_float_array, check_instance
+from ..sky.validation.checks import as_float_array, check_instance, check_sequence
 from .ended import Ended
 from .solver.scene import ComponentStructure
 
@@ -48,10 +48,8 @@ class Blend:
 
     def check(self):
         """Raises ValueError if an observation, a source or the frame has another type."""
-        for i, observation in enumerate(self.observations):
-            check_instance(f"observations[{i}]", observation, Observation)
-        for i, source in enumerate(self.sources):
-            check_instance(f"sources[{i}]", source, Source)
+        check_sequence("observations", self.observations, Observation)
+        check_sequence("sources", self.sources, Source)
         if self.frame is not None:
             check_instance("frame", self.frame, Frame)
         n = len(self.sources)
@@ -122,10 +120,15 @@ class Blend:
     def resolve_frame(self) -> Frame:
         """The frame of the blend, checked; if it has none, a `model_frame` of the observations.
 
-        Raises ValueError for observations that do not fit together, and for a profile of another
-        shape than the frame.
+        Raises ValueError for observations that do not fit together, for no sources, and for a
+        profile of another shape than the frame.
         """
         self.check()
+        if not self.sources:
+            raise ValueError(
+                "sources is empty, at least one is needed: where detect finds none there is "
+                "nothing to fit; list sources, or pass detect a lower threshold"
+            )
         if self.frame is None:
             frame = model_frame(self.observations)
         else:

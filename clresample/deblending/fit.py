@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -57,7 +58,7 @@ class Fit:
         found = inspect(blend, self.frame, positions, shifts, settings)
         blend, settings, shifts = found.blend, found.settings, found.shifts
         positions = self.frame.positions_of(blend.sources, blend.observations, shifts)
-        inside, outside = _inside(self.frame, positions)
+        inside, outside = _inside(self.frame, positions, blend.sources)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
         self.blend, self.settings = blend, settings
@@ -80,7 +81,10 @@ class Fit:
             # models have no noise to amplify
             self.messages += [f"{o.label}: {line}" for line in floor_warnings(view.op.certificate)]
         if not any(view.sqrt_weights.any() for view in self.views):
-            raise ValueError("no observed pixel on the model frame has a weight")
+            raise ValueError(
+                "no observed pixel on the model frame has a weight: check data, weights and "
+                "variance for NaN and 0, the mask, and that the frame covers the images"
+            )
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
@@ -262,16 +266,33 @@ def scene_bytes(fit) -> int:
     return fit.scene.n_bytes + fit.settings.solver_bytes(fit.scene)
 
 
-def _inside(frame, positions):
+def _inside(frame, positions, sources=()):
     """Positions (n,) inside the frame, and messages about the others; ValueError if none is."""
     inside, n = frame.contains(positions), len(positions)
     if not inside.any():
-        raise ValueError(f"none of the {n} sources lies inside the model frame {frame.shape}")
+        raise ValueError(
+            f"none of the {n} sources lies inside the model frame {frame.shape}"
+            + _order_hint(frame, sources)
+        )
     return inside, [
-        f"source {i} at {p} [px] lies outside the model frame {frame.shape}"
+        f"a source lies outside the model frame: source {i} at {p} [px] of {frame.shape}"
         for i, p in enumerate(positions)
         if not inside[i]
     ]
+
+
+def _order_hint(frame, sources):
+    """The order of sky_deg, if any of the sources (n,) has two numbers that seem to be swapped."""
+    own = [s for s in sources if s.sky_deg is not None and s.sky_frame is None]
+    swapped = [replace(s, sky_deg=s.sky_deg[::-1]) for s in own]
+    there = frame.contains(frame.positions_of(swapped))
+    wrong = [s for s, one in zip(own, there, strict=True) if one or abs(s.sky_deg[1]) > 90]
+    if frame.grid.is_flat or not wrong:
+        return ""
+    return (
+        f": sky_deg is {wrong[0].sky_deg}, must be (right ascension, declination) or the WCS's own "
+        "longitude and latitude: swap the two"
+    )
 
 
 def _by_source(fit, values):
@@ -325,6 +346,6 @@ def _dark_message(i_source, position):
     """Message about a source far from any light."""
     y, x = position
     return (
-        f"source {i_source} at (y, x) = ({y:.1f}, {x:.1f}) [px] in the model frame lies far from "
-        f"any light: no image shows {LIGHT_SIGMAS:g} sigma there or beside it"
+        f"a source lies far from any light: source {i_source} at (y, x) = ({y:.1f}, {x:.1f}) [px] "
+        f"in the model frame; no image shows {LIGHT_SIGMAS:g} sigma there or beside it"
     )

@@ -12,6 +12,7 @@ from ..deblending.inspection.spoilt import FLAT_SIGMAS
 from ..sky.box import Box, outline
 from ..sky.filled import filled_pixels
 from ..sky.grid import Grid, as_grid
+from ..sky.noise import NoiseWarning
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
 from ..sky.validation.observed import as_psf
@@ -267,6 +268,7 @@ class Mosaic:
         zero_points = [c.zero_point for c in self.channels]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PSFWarning)  # issued once, when the field is opened
+            warnings.simplefilter("ignore", NoiseWarning)  # a Box may lie in a hole of the data
             psf = self.psf.cutout(box.y0, box.x0) if psf_box is None else self._middle(psf_box)
             return Observation(
                 data,

@@ -34,7 +34,6 @@ FILES = (
     "provenance.json",
 )
 MAX_NOTED = 8  # kinds of messages of fits that notes name
-NUMBER = r"(?<!\w)[-+]?\d[\w.+-]*"  # not those in names, such as of channels
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
     *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
     *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
@@ -95,7 +94,8 @@ def write_outputs(
 def _noted_messages(job, fits) -> list[str]:
     """A line on each kind of messages of a table of fits, the most frequent first.
 
-    Messages of one kind are equal up to their numbers and to the first colon or bracket.
+    Messages of one kind are equal up to the first colon or bracket: all begin with a sentence, and
+    give their numbers after it.
     """
     names = {mosaic.name for mosaic in job.mosaics}
     kinds: Counter[str] = Counter()
@@ -104,7 +104,7 @@ def _noted_messages(job, fits) -> list[str]:
         for line in text.split(SEPARATOR):
             label, _, rest = line.partition(": ")
             known, rest = (f"{label}: ", rest) if label in names else ("", line)
-            found.add(known + re.sub(NUMBER, "#", re.split("[:(]", rest)[0]).strip())
+            found.add(known + re.split("[:(]", rest)[0].strip())
         kinds.update(found - {""})
     most = sorted(kinds.items(), key=lambda pair: (-pair[1], pair[0]))[:MAX_NOTED]
     return [f"{n} of {len(fits)} fits: {kind}; see fit_table.ecsv" for kind, n in most]

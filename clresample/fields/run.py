@@ -14,6 +14,7 @@ from astropy.coordinates import SkyCoord
 from ..deblending.ended import Ended
 from ..deblending.settings import AUTO, SMALL
 from ..sky.box import Box
+from ..sky.validation.checks import check_instance, check_sequence
 from ..sky.wcs import celestial_frame
 from .blends.tiles import field_part
 from .execution.backend import make_backend
@@ -23,6 +24,7 @@ from .execution.rounds import fit_all_groups
 from .execution.search_setup import prepare_search, read_search_setup
 from .execution.searching import load_or_make_plan
 from .hats import check_hats
+from .mosaic import Mosaic
 from .options import MIN_MEMORY, FieldOptions, RunProgress
 from .outputs import FieldOutputs, check_outputs, write_outputs
 from .reference import reference_grid as reference_grid
@@ -65,7 +67,8 @@ def run_field(
     and where nothing can be written; ImportError without sep, and without what HATS needs.
     """
     options, progress = options or FieldOptions(), progress or RunProgress()
-    mosaics, folder = _as_sent(mosaics), Path(folder)
+    check_instance("options", options, FieldOptions)
+    mosaics, folder = _as_sent(check_sequence("mosaics", mosaics, Mosaic)), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_grid(mosaics)
     options = replace(options, positions=_degrees(options.positions, reference))

@@ -27,6 +27,11 @@ VALID_PART = 0.25
 # level. They differ by up to 0.05 of the noise in simulated fields; by 0.1 to 0.4, and by 0.29 of
 # the level, in images full of a galaxy, with a gradient, or with dark bowls about galaxies.
 AGREEING, ALIKE = (0.05, 0.25), 0.1
+# Words of messages of fits, and those where the run has subtracted a level.
+OF_RUN = {
+    "too much sky was subtracted": "the sky is darker than the level that the run subtracted",
+    "sky is left in": "the sky is brighter than the level that the run subtracted",
+}
 # [1] of a pixel's noise: smaller levels are left.
 MIN_LEVEL = 0.05
 
@@ -112,6 +117,16 @@ def subtracted_levels(mosaics) -> dict[str, float]:
     return {
         c.name: c.background.level for c in channels if isinstance(c.background, ConstantBackground)
     }
+
+
+def messages_in_run(messages, mosaics) -> list[str]:
+    """Messages of a fit, in which skies of mosaics that a run lowered are about its own level."""
+    names = [m.name for m in mosaics if subtracted_levels([m])]
+    of_run = {f"{name}: {old}": f"{name}: {new}" for name in names for old, new in OF_RUN.items()}
+    return [
+        next((new + line[len(old) :] for old, new in of_run.items() if line.startswith(old)), line)
+        for line in messages
+    ]
 
 
 def sky_notes(mosaics, found) -> list[str]:

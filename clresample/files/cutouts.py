@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import Table
 
+from ..sky.validation.checks import check_sequence
 from .array_hdus import array_of
 from .atomic import FileError, check_output
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
@@ -32,7 +33,7 @@ def write_cutouts(path, cutouts, *, overwrite=False, device=None, inputs=None):
 
     Raises FileError when it exists or cannot be written, ValueError for no cutout.
     """
-    path, cutouts = Path(path), list(cutouts)
+    path, cutouts = Path(path), check_sequence("cutouts", cutouts, CCDData)
     check_output(path, overwrite=overwrite)
     if not cutouts:
         raise ValueError("cutouts is empty, must hold one or more")

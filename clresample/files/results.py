@@ -22,6 +22,7 @@ from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
 from ..sky.sources import ExtendedSource, PointSource, Source
+from ..sky.validation.checks import check_instance
 from .array_hdus import array_of, image_hdu
 from .atomic import FileError, check_output
 from .draws import draw_hdus, read_draws
@@ -72,7 +73,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     Raises FileError when the file exists or cannot be written.
     """
     path = Path(path)
-    check_channels(result.channels)
+    check_channels(check_instance("result", result, Result).channels)
     check_output(path, overwrite=overwrite)
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = text_card(" ".join(result.status.split()), "how the fit ended")

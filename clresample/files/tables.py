@@ -11,6 +11,7 @@ from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyWarning
 
 from ..measurement.catalogue import FLAG_MEANINGS
+from ..sky.validation.checks import check_instance
 from .atomic import FileError, atomic_file, check_output
 from .fits import write_hdus
 from .fits_names import check_columns, to_ascii
@@ -61,6 +62,7 @@ def write_catalogue(path, table, *, overwrite=False):
     path = Path(path)
     if not path.name.endswith(ENDINGS):
         raise ValueError(f"path is {path.name}, a catalogue ends in {', '.join(ENDINGS)}")
+    check_instance("table", table, Table)
     check_output(path, overwrite=overwrite)
     if ".fits" in path.suffixes:
         return write_hdus(

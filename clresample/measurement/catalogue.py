@@ -14,8 +14,10 @@ from ..deblending.assessment.edge import reaches_outside
 from ..deblending.assessment.status import misfitted_sources
 from ..deblending.assessment.unsettled import unsettled_sources
 from ..deblending.posterior.residuals import channel_residuals
+from ..deblending.result import Result
 from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
+from ..sky.validation.checks import check_instance
 from ..sky.wcs import axis_names, celestial_frame, local_axes
 from .columns import Columns, definition
 from .photometry import add_groups, channel_covariances, flux_scale, fluxes
@@ -116,6 +118,7 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         ambiguous_with: row of the source whose light cannot be told apart from this source's, see
             `is_ambiguous`; -1 if there is none
     """
+    check_instance("result", result, Result)
     table = catalogue_columns(result, magnitudes=magnitudes, groups=groups).table()
     describe_flags(table)
     return table

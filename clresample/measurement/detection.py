@@ -24,10 +24,12 @@ from ..deblending.inspection.filled import without_filled
 from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.linear.spectra import MODEL_ERROR
+from ..deblending.result import Result
 from ..drawing.display import ShownDetection
 from ..sky.frame import Frame, model_frame
-from ..sky.observation import Observation, as_observations
+from ..sky.observation import Observation, as_observations, check_observations
 from ..sky.sources import ExtendedSource, PointSource, Source
+from ..sky.validation.checks import check_instance
 from .clumps import bodies_of
 from .companions import (
     LEVEL_FWHM,
@@ -108,7 +110,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     Source: see the head of this module.
     """
     observations = as_observations(observations)
-    frame = model_frame(observations) if frame is None else frame
+    check_observations(observations)
+    frame = model_frame(observations) if frame is None else check_instance("frame", frame, Frame)
     observations = without_rays(without_filled(observations)[0], frame)
     return _search(observations, frame, threshold, [], scatters)
 
@@ -136,6 +139,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
 
     Raises ValueError and ImportError as `detect` does.
     """
+    check_instance("result", result, Result)
     left = []
     for i, o in enumerate(result.observations):
         sky = result.sky[result.channel_slices()[i], None, None]

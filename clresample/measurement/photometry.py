@@ -7,6 +7,8 @@ from astropy import units as u
 
 from ..deblending.cutouts.separation import faintest_light, fraction_of, source_image
 from ..deblending.posterior.sampling import undetermined
+from ..deblending.result import Result
+from ..sky.validation.checks import check_instance
 
 
 def fluxes(result):
@@ -26,6 +28,7 @@ def fluxes(result):
         where a channel does not determine a flux, as one without weights, and for sources without
         components; their covariances with others are 0
     """
+    check_instance("result", result, Result)
     sums = np.zeros((len(result.sources), len(result.components)))
     for i, component in enumerate(result.components):
         sums[component.source, i] = component.morphology.sum(dtype=np.float64)
@@ -77,6 +80,7 @@ def redistribute(result, i_observation) -> np.ndarray:
     returns (S, Co, My, Mx) [counts]: NaN where the data have no weight
     Source: the deblender of SDSS (R. Lupton), with fitted models as its templates.
     """
+    check_instance("result", result, Result)
     i_observation = result.index_of(i_observation)
     observation = result.observations[i_observation]
     channels = result.channel_slices()[i_observation]

@@ -6,7 +6,9 @@ import numpy as np
 
 from ..deblending.assessment.status import misfitted_sources
 from ..deblending.posterior.residuals import pixels_in_boxes
+from ..deblending.result import Result
 from ..sky.sources import PointSource
+from ..sky.validation.checks import check_instance
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5
@@ -27,6 +29,7 @@ def summary(result) -> dict:
         are flagged MISFIT (`misfitted_sources`); good, True if the fit converged at a model that
         describes the data and no source is a misfit
     """
+    check_instance("result", result, Result)
     chi2, n_pixels = channel_chi2(result)
     misfits = np.flatnonzero(misfitted_sources(result)).tolist()
     return {

@@ -18,6 +18,7 @@ from ..device.device import get_device
 from ..resampling.resampler import Resampler
 from ..sky.frame import model_frame
 from ..sky.sources import ExtendedSource
+from ..sky.validation.checks import check_instance
 from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain
 
 # [sigma] Signal to noise at a source's centre from which an instrument's image is used: below it
@@ -35,6 +36,7 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
 
     Raises ValueError where `model_frame` does.
     """
+    check_instance("blend", blend, Blend)
     device = get_device(device)
     frame = blend.frame or model_frame(blend.observations)
     positions = frame.positions_of(blend.sources, blend.observations, blend.initial_shifts())

@@ -69,8 +69,8 @@ def floor_warnings(certificate: Certificate) -> list[str]:
     if floored <= FLOORED_POWER:
         return []
     return [
-        f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
-        f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
+        "the observed PSF has power where the model's has hardly any: the division is floored for "
+        f"{floored:.2%} of it, at less than {DIVISION_FLOOR:g} of the model's light"
     ]
 
 

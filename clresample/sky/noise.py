@@ -13,7 +13,7 @@ from .validation.checks import as_float_array, mask_of, split_mask, to_unit
 
 
 class NoiseWarning(UserWarning):
-    """An image without weights, whose noise was estimated from its background."""
+    """An image whose noise was estimated from its background, or that has no usable pixel."""
 
 
 # [sigma] Pixels further from the median count as sources; so does one in 370 of pure noise.
@@ -138,8 +138,8 @@ def weights_from(data, bad, given, mask, channels, unit=None):
     given: weights, variance and mask, as in Observation; None if not passed
     channels (C,): names; unit: of the data, None if they have none
 
-    Warns (NoiseWarning) of noise that is estimated. Raises ValueError where Observation does, for
-    these.
+    Warns (NoiseWarning) of noise that is estimated, and of images without any usable pixel. Raises
+    ValueError where Observation does, for these.
     """
     weights, variance = given
     if weights is not None and variance is not None:
@@ -164,6 +164,13 @@ def weights_from(data, bad, given, mask, channels, unit=None):
         found = np.concatenate(images), sum(counts), [line for one in messages for line in one]
     if estimates:
         warnings.warn("; ".join(estimates), NoiseWarning, stacklevel=3)
+    if found[1] and not found[0].any():  # images that are masked everywhere have none on purpose
+        warnings.warn(
+            f"no pixel of {', '.join(channels)} has a weight, and nothing can be measured: data, "
+            "weights or variance are NaN, infinite or 0 everywhere; check what was read",
+            NoiseWarning,
+            stacklevel=3,
+        )
     return found
 
 

@@ -13,7 +13,7 @@ from .correlation import NoiseCorrelation, channel_correlations
 from .grid import Grid
 from .noise import weights_from
 from .psf import PSF
-from .validation.checks import ReadOnly, described
+from .validation.checks import ReadOnly, check_sequence, described
 from .validation.containers import arguments_of, is_container
 from .validation.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
 from .validation.observed import (
@@ -63,7 +63,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
     Without weights and variance the noise of each channel is estimated from the scatter of the
     background (`noise_sigma`), as one number without the photon noise of sources, and a
-    NoiseWarning is issued.
+    NoiseWarning is issued, as of images without any usable pixel.
 
     Attributes: data and weights (C, Ny, Nx) float64; psf of C bands, that in the middle of the
     image; psf_field of C bands if the PSF varies, else None; zero_points and noise (C,) or None;
@@ -244,6 +244,7 @@ def check_observations(observations):
     """
     if not observations:
         raise ValueError("observations is empty, at least one is needed")
+    check_sequence("observations", observations, Observation)
     first = {}
     for observation in observations:
         for channel in observation.channels:

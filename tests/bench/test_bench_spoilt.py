@@ -117,6 +117,6 @@ def test_a_warning_of_two_close_sources_is_false_where_they_are_apart(apart_px, 
     grid = scene.observations[-1].grid
     y, x = grid.pixel(*scene.places[0])
     scene = replace(scene, places=np.array([scene.places[0], grid.sky(y, x + apart_px)]))
-    texts = [f"sources 0 and 1 lie within 1 pixel {DOUBLES}", "sky is left in"]
+    texts = [f"sources lie within 1 pixel of each other: 0 and 1; {DOUBLES}", "sky is left in"]
     assert false_texts(texts, "sim", scene) == texts[1 - said :]
     assert false_texts(["light that no source is listed for"], "hsc_blend", scene) == []

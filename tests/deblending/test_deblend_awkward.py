@@ -41,7 +41,9 @@ def test_a_source_outside_is_reported_and_left_out(device):
     result = deblend(b.observations, more, frame=b.frame, device=device, settings=EXACT)
     assert [c.source for c in result.components] == [0, 2]
     assert len(result.messages) == 1
-    assert result.messages[0].startswith("source 1 at [15.  35.6] [px] lies outside the model")
+    assert result.messages[0].startswith(
+        "a source lies outside the model frame: source 1 at [15.  35.6]"
+    )
     assert not np.any(result.source_model(1))
     same(result, fit(b, device, settings=EXACT))
     with pytest.raises(ValueError, match="none of the 1 sources lies inside"):

@@ -1,10 +1,12 @@
 """Rules of fits, in tables: their ends, groups and parts, failures, and limits of one fit."""
 
 import contextlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from helpers import scenes
 
 from clresample.deblending import batch, fit as fit_module
@@ -15,6 +17,8 @@ from clresample.deblending.fit import Fit, data_bytes
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.scene import Scene
 from clresample.paper.run import DIVERGENCE_RATIO, PATIENCE, stop_reason
+from clresample.sky.frame import Frame
+from clresample.sky.grid import Grid
 from clresample.sky.sources import ExtendedSource, SourceWarning
 
 FLAT = [100.0] * 16
@@ -38,13 +42,40 @@ def test_sources_outside_the_frame_are_named():
     home = scenes.frame()
     inside, messages = fit_module._inside(home, np.array([(3.0, 4.0), (30.0, 4.0)]))
     assert inside.tolist() == [True, False] and len(messages) == 1
-    assert messages[0].startswith("source 1 at [30.") and "(30, 36)" in messages[0]
+    assert (
+        messages[0].startswith("a source lies outside the model frame: source 1 at [30.")
+        and "(30, 36)" in messages[0]
+    )
     with pytest.raises(ValueError, match=r"none of the 2 sources lies inside .* \(30, 36\)"):
         fit_module._inside(home, np.array([(-3.0, 4.0), (30.0, 4.0)]))
     assert fit_module._dark_message(3, (1.26, 4.0)) == (
-        "source 3 at (y, x) = (1.3, 4.0) [px] in the model frame lies far from any light: no image "
-        "shows 3 sigma there or beside it"
+        "a source lies far from any light: source 3 at (y, x) = (1.3, 4.0) [px] in the model "
+        "frame; no image shows 3 sigma there or beside it"
     )
+
+
+@pytest.mark.parametrize(
+    "sky_deg, hint",
+    [
+        ((2.0, 150.0), True),  # no declination
+        ((2.5, 12.3), True),  # one
+        ((12.3, 3.5), False),
+        (SkyCoord(2.5, 12.3, unit="deg"), False),  # has an order of its own
+    ],
+)
+def test_swapped_coordinates_are_named(sky_deg, hint):
+    ra = 150 if hint and sky_deg[1] == 150 else 12.3
+    wcs = Grid.flat((30, 36), 0.2).to_wcs(ra_deg=ra, dec_deg=2.5)
+    home = Frame(Grid.from_wcs(wcs, (30, 36)), scenes.SHARP)
+    sources = (ExtendedSource(sky_deg=sky_deg),)
+    with pytest.raises(ValueError, match="none of the 1 sources") as error:
+        fit_module._inside(home, home.positions_of(sources), sources)
+    assert ("must be (right ascension, declination)" in str(error.value)) is hint
+
+
+def test_an_empty_list_of_sources_is_named():
+    with pytest.raises(ValueError, match="sources is empty, at least one .* list sources"):
+        replace(scenes.blend(), sources=()).resolve_frame()
 
 
 @pytest.mark.parametrize("fit_shifts", [False, True])
@@ -151,8 +182,6 @@ def test_what_a_failure_says():
     assert batch._failure("b", ValueError("no")) == Failure("b", Ended.FAILED, "no", ValueError)
     assert batch._failure("b", KeyError("no")).reason == "KeyError: 'no'"
     assert not Failure("b", Ended.FAILED).converged
-    with pytest.raises(ValueError, match="blends is 3 .int., must be a sequence"):
-        batch._listed("blends", 3)
     for n, words in ((1, "1 source position"), (2, "2 source positions")):
         with pytest.warns(SourceWarning, match=f"{words} here: see Result"):
             batch._warn_dark([np.arange(n)], " here")

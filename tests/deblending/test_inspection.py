@@ -167,7 +167,7 @@ def test_doubles_are_named_unless_of_two_kinds():
     o, near = observed(image_of()), DRAWN[0][0][0] + 0.6
     twin = ExtendedSource(position_px=(near, DRAWN[0][0][1]))
     (message,) = inspected([o], (*sources_of(), twin)).messages
-    assert message.startswith("sources 0 and 3 lie within 1 model pixel")
+    assert message.startswith("sources lie within 1 model pixel of each other: 0 and 3;")
     core = PointSource(position_px=DRAWN[0][0])
     assert inspected([o], (*sources_of(), core)).messages == []
 
@@ -175,7 +175,10 @@ def test_doubles_are_named_unless_of_two_kinds():
 def test_positions_that_are_all_off_are_named():
     moved = tuple(ExtendedSource(position_px=(y + 1, x + 1)) for (y, x), _, _ in DRAWN)
     messages = inspected([observed(image_of())], moved).messages
-    assert any("light lies at (-1." in m and "FITS counts from 1" in m for m in messages)
+    assert any(
+        "light lies away from their positions: by (-1." in m and "FITS counts from 1" in m
+        for m in messages
+    )
 
 
 @pytest.mark.parametrize("factor, word", [(1.25, "too wide"), (0.8, "too narrow")])

@@ -138,11 +138,12 @@ def test_a_source_far_from_any_light_is_warned_about(device):
     with pytest.warns(SourceWarning, match=f"{two}: see") as caught:
         result = fit(b, device, settings=SHORT)
     assert [w.category for w in caught].count(SourceWarning) == 1  # compilers may say more
-    assert [m.split(" lies")[0] for m in result.messages] == [
-        "source 2 at (y, x) = (90.0, 95.0) [px] in the model frame",
-        "source 3 at (y, x) = (100.0, 20.0) [px] in the model frame",
+    assert [m.split("; no image")[0] for m in result.messages] == [
+        "a source lies far from any light: source 2 at (y, x) = (90.0, 95.0) [px] in the model "
+        "frame",
+        "a source lies far from any light: source 3 at (y, x) = (100.0, 20.0) [px] in the model "
+        "frame",
     ]
-    assert "far from any light: no image shows 3 sigma" in result.messages[0]
     with pytest.warns(SourceWarning, match=f"{two} of blends that were fitted together"):
         results = deblend_many([b, wide_blend()], settings=SHORT, device=device)
     assert results[0].messages == result.messages and results[1].messages == ()
@@ -198,4 +199,4 @@ def test_where_nothing_was_seen_there_is_no_light(device):
     seen = ExtendedSource(position_px=GALAXIES[0][0], observation="e")
     with pytest.warns(SourceWarning, match="1 source position:"):
         result = deblend(b.observations, [seen, corner], device=device, settings=SHORT)
-    assert any(m.startswith("source 1 at") for m in result.messages)
+    assert any("any light: source 1 at" in m for m in result.messages)

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,17 +47,58 @@ def test_every_column_has_its_unit_and_a_description(done):
 def test_messages_of_fits_are_counted_by_their_kind():
     job = SimpleNamespace(mosaics=[SimpleNamespace(name="acs_f814w")])
     texts = [
-        "acs_f814w: sky is left in: g +0.3 sigma | light in B2 lies at (1, 2)",
+        "acs_f814w: sky is left in: g +0.3 sigma | light in B2 lies away from that in C: by (1, 2)",
         "",
         "acs_f814w: sky is left in: r",
     ]
-    fits = QTable(
-        {"messages": [*texts, "light in B2 lies at (3, 4) | light in B2 lies at (5, -1e3)"]}
-    )
+    twice = "light in B2 lies away from that in C: by (3, 4)"
+    fits = QTable({"messages": [*texts, f"{twice} | {twice}"]})
     assert _noted_messages(job, fits) == [
         "2 of 4 fits: acs_f814w: sky is left in; see fit_table.ecsv",
-        "2 of 4 fits: light in B2 lies at; see fit_table.ecsv",
+        "2 of 4 fits: light in B2 lies away from that in C; see fit_table.ecsv",
     ]
+
+
+SOURCES = tuple(Path(clresample.__file__).parent.glob("[dr]e*/**/*.py"))
+LEVELS = "sky is left in", "too much sky was subtracted"  # in a table, the colon elsewhere
+SENTENCES = (
+    *LEVELS,
+    "a source is {} than the PSF of {}",
+    "a source lies far from any light",
+    "a source lies outside the model frame",
+    "channel {} has light sharper than its PSF",
+    "channel {} has pixels sharper than its PSF, cosmic rays or hot pixels",
+    "channel {} is saturated",
+    "errors are those of fixed morphologies",
+    "light in channel {} lies away from that in {}",
+    "light in {} lies away from that in {}",
+    "no pixel of {} has a weight",
+    "pixels without a source do not scatter as the weights say",
+    "second components could not be fitted",
+    "sources lie within {} model pixel of each other",
+    "the PSF of {} is sampled too coarsely",
+    "the model does not describe the data",
+    "the noise of neighbouring pixels is correlated",
+    "the observed PSF has power where the model's has hardly any",
+    "the pixels furthest from the sources are not dark",
+    "the sky is fitted, and pixels without a source hardly tell its level",
+    "the sky's level is unsure, as the sources' wings reach all over the image",
+    "the sources' light lies away from their positions",
+    "there is light that no source is listed for",
+)
+
+
+@pytest.mark.parametrize("sentence", SENTENCES)
+def test_every_message_of_a_fit_begins_with_a_sentence(sentence):
+    """In the code, where strings go on over lines, it is followed by a colon or bracket."""
+    code = "".join(re.sub(r'"\s*f?"', "", path.read_text()) for path in SOURCES)
+    pattern = re.escape(sentence).replace(r"\{\}", r"\{[^}]*\}")
+    end = '"' if sentence in LEVELS else " ?[:(]"
+    assert re.search('[" ]' + pattern + end, code)
+    line = "A: " + sentence.format("1", "g") + ": at (1, 2)"
+    job = SimpleNamespace(mosaics=[SimpleNamespace(name="A")])
+    (note,) = _noted_messages(job, QTable({"messages": [line]}))
+    assert note == f"1 of 1 fits: A: {sentence.format('1', 'g')}; see fit_table.ecsv"
 
 
 @pytest.fixture(scope="module")

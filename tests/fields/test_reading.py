@@ -20,6 +20,7 @@ from clresample.fields.options import FieldOptions, RunProgress
 from clresample.fields.sky_level import (
     find_sky,
     measured_sky,
+    messages_in_run,
     sky_notes,
     subtracted_levels,
     without_sky,
@@ -136,6 +137,13 @@ def test_a_sky_that_was_left_in_is_measured_once_and_subtracted(tmp_path, level)
     assert part == pytest.approx(level, abs=0.05) and counts == pytest.approx(2 * part, rel=0.02)
     box = Box(5, 7, 9, 12)
     np.testing.assert_array_equal(channel.read(box), plain.read(box) - counts)
+    told = ["A: sky is left in: r", "B: sky is left in: r"]
+    assert messages_in_run(told, [mosaic(image)]) == told
+    own = f"{lowered.name}: too much sky was subtracted: r -1"
+    assert messages_in_run([own, told[1]], [lowered]) == [
+        f"{lowered.name}: the sky is darker than the level that the run subtracted: r -1",
+        told[1],
+    ]
     (note,) = sky_notes([lowered], found)
     assert f"r {part:+.2f}" in note and "fit_sky=False" in note
 

@@ -1,5 +1,7 @@
 """A small image of two galaxies and a star, and what is found before it is fitted."""
 
+import re
+
 import numpy as np
 
 from clresample.deblending.blend import Blend
@@ -44,7 +46,11 @@ def inspected(observations, sources=None, **settings):
     frame = model_frame(blend.observations)
     shifts = np.zeros((len(blend.observations), 2))
     positions = frame.positions_of(blend.sources, blend.observations)
-    return inspect(blend, frame, positions, shifts, Settings(**settings))
+    found = inspect(blend, frame, positions, shifts, Settings(**settings))
+    for message in found.messages:  # notes of fields consist of the first sentences
+        sentence = re.split("[:(]", message.removeprefix("cam: "))[0]
+        assert re.findall(r"(?<!\w)[-+]?\d", sentence.replace("within 1 model pixel", "")) == []
+    return found
 
 
 def looked_at(observation, sources=None):

@@ -8,9 +8,11 @@ from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.utils.masked import Masked
 from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 
+import clresample
 from clresample import (
     PSF,
     ExtendedSource,
+    Failure,
     Frame,
     Grid,
     NoiseWarning,
@@ -20,6 +22,7 @@ from clresample import (
     deblend,
     model_frame,
 )
+from clresample.deblending.ended import Ended
 from clresample.sky.validation.checks import described
 
 SHAPE = (24, 28)
@@ -114,6 +117,42 @@ def test_messages_name_the_way_and_dump_no_array():
     assert described([1.0] * 50) == "of type list"
     with pytest.raises(ValueError, match="observations is a single one, must be a sequence"):
         deblend(Observation(NOISE, ROUND, GRID, weights=1.0), [ExtendedSource(position_px=(1, 2))])
+
+
+SEEN = Observation(NOISE, ROUND, GRID, weights=1.0)
+RESULT, OBSERVATION = (
+    "result is .*, must be Result: give a result of deblend",
+    "must be Observation",
+)
+
+
+@pytest.mark.parametrize(
+    "function, given, said",
+    [
+        (clresample.catalogue, SEEN, RESULT),
+        (clresample.catalogue, Failure(None, Ended.FAILED), RESULT),
+        (clresample.fluxes, None, RESULT),
+        (lambda given: clresample.redistribute(given, 0), SEEN, RESULT),
+        (clresample.summary, [SEEN], RESULT),
+        (clresample.detect_more, SEEN, RESULT),
+        (lambda given: clresample.write_result("a.fits", given), SEEN, RESULT),
+        (lambda given: clresample.write_catalogue("a.ecsv", given), SEEN, "table is .* Table"),
+        (lambda given: clresample.write_cutouts("a.fits", given), [SEEN], "cutouts.0. .* CCDData"),
+        (clresample.detect, [GRID], OBSERVATION),
+        (lambda given: clresample.detect([SEEN], given), GRID, "frame is .*, must be Frame: give"),
+        (clresample.model_frame, [GRID], OBSERVATION),
+        (clresample.match, 5, r"observations is 5 \(int\), must be a sequence"),
+        (clresample.match, [GRID], OBSERVATION),
+        (clresample.deblend_many, SEEN, "blends is .*, must be a sequence"),
+        (clresample.with_image_profiles, SEEN, "blend is .*, must be Blend: give Blend"),
+        (lambda given: clresample.run_field(given, "run"), [SEEN], "mosaics.0. .*, must be Mosaic"),
+    ],
+)
+def test_an_object_of_another_kind_is_named(function, given, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=said):
+        function(given)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

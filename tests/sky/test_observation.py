@@ -1,9 +1,12 @@
 """Observations: every way of giving the noise, and what is checked."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from clresample.sky.grid import Grid
+from clresample.sky.noise import NoiseWarning
 from clresample.sky.observation import Observation, check_observations
 from clresample.sky.psf import PSF
 
@@ -94,6 +97,28 @@ def test_a_channel_without_a_pixel_is_reported(given):
     assert observation.n_invalid == data[1].size
     assert observation.messages[-1] == "channel r has no pixel with a weight"
     assert observation.weights[[0, 2]].all() and not observation.weights[1].any()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"data": np.full(SHAPE, np.nan), "weights": 1.0},
+        {"data": np.full(SHAPE, np.nan)},
+        {"variance": 0.0},
+        {"variance": np.nan},
+        {"weights": np.nan},
+    ],
+)
+def test_an_image_without_any_usable_pixel_is_warned_of(given):
+    with pytest.warns(NoiseWarning, match="no pixel of g, r, i has a weight, and nothing can"):
+        assert not observe(**given, channels=("g", "r", "i")).weights.any()
+
+
+@pytest.mark.parametrize("given", [{"mask": np.ones(SHAPE, bool)}, {"weights": 0.0}])
+def test_an_image_that_is_masked_on_purpose_is_not(given):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not observe(**{"weights": 1.0} | given).weights.any()
 
 
 def test_weight_zero_needs_no_data():

@@ -143,7 +143,7 @@ def _doubles(sources, positions):
         return []
     some = ", ".join(f"{i} and {j}" for i, j in pairs[:5])
     return [
-        f"sources {some} lie within {listing.SAME_PLACE_PX:g} model pixel of each other: no image "
+        f"sources lie within {listing.SAME_PLACE_PX:g} model pixel of each other: {some}; no image "
         "tells their fluxes apart; if they are one source listed twice, leave one out"
     ]
 
@@ -219,8 +219,8 @@ def _level_lines(image, sky, shown, expected, fitted):
     doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART) and (mean > 0 or rim.mean() < -unsure)
     if rim.mean() > RIM_PART + unsure:
         lines.append(
-            "the pixels furthest from the sources are not dark, "
-            f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
+            "the pixels furthest from the sources are not dark: "
+            f"{_parts(image, sky.rim, rim > 0)} a pixel; sky is left in, or wings of the sources "
             "end beyond the image, and fluxes include a part of it; give fit_sky=True or a larger "
             "image"
         )
@@ -284,8 +284,8 @@ def _spoilt(image):
     for c in np.flatnonzero(kept.any(axis=(1, 2))):
         y, x = np.argwhere(kept[c])[0]
         lines.append(
-            f"channel {names[c]} has light sharper than its PSF at (y, x) = ({y}, {x}), "
-            f"{'on a source' if on_source[c].any() else 'in other channels too'}: the PSF is too "
+            f"channel {names[c]} has light sharper than its PSF: at (y, x) = ({y}, {x}), "
+            f"{'on a source' if on_source[c].any() else 'in other channels too'}; the PSF is too "
             "wide, or a cosmic ray lies there; it is fitted as it is: mask it if it is none of the "
             "sky's"
         )
@@ -293,8 +293,8 @@ def _spoilt(image):
     for c in np.flatnonzero(rays.any(axis=(1, 2))):
         y, x = np.argwhere((sharp & ~kept)[c])[0]
         lines.append(
-            f"channel {names[c]} has {(sharp & ~kept)[c].sum()} pixels sharper than its PSF, "
-            f"cosmic rays or hot pixels, the first at (y, x) = ({y}, {x}): they and those beside "
+            f"channel {names[c]} has pixels sharper than its PSF, cosmic rays or hot pixels: "
+            f"{(sharp & ~kept)[c].sum()}, the first at (y, x) = ({y}, {x}); they and those beside "
             "them are masked"
         )
     return full | rays, lines
@@ -329,8 +329,8 @@ def _missing(image):
         return []
     some = ", ".join(f"({y}, {x}) at {value:.0f} sigma" for value, y, x in peaks[:3])
     return [
-        f"light that no source is listed for, brightest at (y, x) = {some}: it goes to the "
-        "neighbours; list it, or run detection"
+        f"there is light that no source is listed for: brightest at (y, x) = {some}; it goes to "
+        "the neighbours; list it, or run detection"
     ]
 
 
@@ -342,8 +342,8 @@ def _offset(images, found):
         return []
     (y, x), error = offset
     return [
-        f"{images[i].observation.label}: the sources' light lies at ({y:+.2f}, {x:+.2f}) +- "
-        f"{error.max():.1g} pixels (y, x) from their positions: these are wrong by as much (the "
+        f"{images[i].observation.label}: the sources' light lies away from their positions: by "
+        f"({y:+.2f}, {x:+.2f}) +- {error.max():.1g} pixels (y, x); these are wrong by as much (the "
         "centre of the first pixel is (0, 0), FITS counts from 1), or the WCS is"
     ]
 
@@ -355,7 +355,7 @@ def _widths(image, sources, numbers):
         how = "narrower" if part < 0 else "wider"
         which = "too wide" if part < 0 else "too narrow, or the source is no star"
         lines.append(
-            f"source {numbers[i]} is {how} than the PSF of {image.observation.channels[c]} by "
-            f"{100 * abs(part):.0f} +- {100 * error:.1g} %: the PSF is {which}"
+            f"a source is {how} than the PSF of {image.observation.channels[c]}: source "
+            f"{numbers[i]} by {100 * abs(part):.0f} +- {100 * error:.1g} %; the PSF is {which}"
         )
     return lines

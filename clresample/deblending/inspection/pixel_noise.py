@@ -46,17 +46,18 @@ def noise_lines(image, sky) -> list[str]:
     if o.noise is None and correlated.any():
         side, ratio = sky.blocks.side, np.median(sky.block_scatter[correlated])
         lines.append(
-            "the noise of neighbouring pixels is correlated, by "
-            f"{_parts(o.channels, correlation, correlated)}: means over {side} x {side} pixels "
+            "the noise of neighbouring pixels is correlated: by "
+            f"{_parts(o.channels, correlation, correlated)}; means over {side} x {side} pixels "
             f"scatter {ratio:.2g} times as much as of white noise, and errors of fluxes are too "
             'small by about as much; give noise="estimate", or what is known of it'
         )
     wrong = (scatter > MAX_RATIO) | (scatter < 1 / MAX_RATIO)
     if wrong.any():
         lines.append(
-            f"pixels without a source scatter by {_parts(o.channels, scatter, wrong)} times what "
-            "the weights say: errors of fluxes are wrong by about as much, and chi2 by its "
-            "square; scale weights or variance, unless faint sources fill the image"
+            "pixels without a source do not scatter as the weights say: by "
+            f"{_parts(o.channels, scatter, wrong)} times that; errors of fluxes are wrong by about "
+            "as much, and chi2 by its square; scale weights or variance, unless faint sources fill "
+            "the image"
         )
     return lines
 

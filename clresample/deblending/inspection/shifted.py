@@ -50,8 +50,8 @@ def disagreements(images, found, fit_shifts):
         names = [images[k].observation.label for k in (first, i)]
         cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
         lines.append(
-            f"light in {names[1]} lies at ({shift[0]:+.2f}, {shift[1]:+.2f}) +- {error.max():.1g} "
-            f"model pixels (y, x) from that in {names[0]}: their WCS disagree; {cure}"
+            f"light in {names[1]} lies away from that in {names[0]}: by ({shift[0]:+.2f}, "
+            f"{shift[1]:+.2f}) +- {error.max():.1g} model pixels (y, x); their WCS disagree; {cure}"
         )
     return (moved - moved[0] if fit_shifts and moved.any() else None), lines
 
@@ -144,8 +144,8 @@ def _channel_lines(image, found):
         if significant(shift, error, MIN_CHANNEL_PX, CHANNEL_SIGMAS):
             names = image.observation.channels
             lines.append(
-                f"{image.observation.label}: light in channel {names[c]} lies at ({shift[0]:+.2f}, "
-                f"{shift[1]:+.2f}) +- {error.max():.1g} pixels (y, x) from that in {names[first]}: "
-                "give the channels as observations of their own, which fit_shifts moves"
+                f"{image.observation.label}: light in channel {names[c]} lies away from that in "
+                f"{names[first]}: by ({shift[0]:+.2f}, {shift[1]:+.2f}) +- {error.max():.1g} px "
+                "(y, x); give the channels as observations of their own, which fit_shifts moves"
             )
     return lines

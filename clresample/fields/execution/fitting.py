@@ -29,6 +29,7 @@ from ...sky.sources import ExtendedSource
 from ..blends.cutouts import make_blend, with_profiles
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
+from ..sky_level import messages_in_run
 from .group_results import SEPARATOR, GroupResults
 
 # Errors that concern one patch only: the others of its group continue.
@@ -357,7 +358,7 @@ def _take(part, job, cut, result, n_round):
             patch.box.area,
             n_iterations,
             seconds,
-            _ascii(SEPARATOR.join(result.messages)),
+            _ascii(SEPARATOR.join(messages_in_run(result.messages, job.mosaics))),
         )
     )
 

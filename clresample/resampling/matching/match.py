@@ -12,7 +12,7 @@ from ...sky.grid import Grid
 from ...sky.observation import Observation, check_observations
 from ...sky.psf import PSF
 from ...sky.psf_checks import PSFWarning
-from ...sky.validation.checks import check_instance
+from ...sky.validation.checks import check_instance, check_sequence
 from ..plan import is_identity
 from ..tiled.resampler import TiledResampler
 from .kernel import NoiseKernel
@@ -49,7 +49,9 @@ def match(observations, grid=None, psf=None, *, max_gain=2.0, device=None) -> Ob
     Raises ValueError for incompatible observations, a grid that none of them overlaps,
     a PSF of several bands, and a gain over max_gain.
     """
-    observations = [observations] if isinstance(observations, Observation) else list(observations)
+    if isinstance(observations, Observation):
+        observations = (observations,)
+    observations = check_sequence("observations", observations)
     check_observations(observations)
     like, band = widest(observations)
     if grid is None:

@@ -19,6 +19,12 @@ WAYS = {
     "Grid": "Grid.from_wcs(wcs, shape) or Grid.flat(shape, scale_arcsec)",
     "PSF": "PSF(array)",
     "Observation": "Observation(data, psf, grid) or Observation.from_nddata(image, psf)",
+    "Blend": "Blend(observations, sources)",
+    "Result": "a result of deblend, or one of deblend_many",
+    "Frame": "model_frame(observations)",
+    "Mosaic": "Mosaic.of_arrays(...), or those of read_field",
+    "CCDData": "cutouts of Result.cutout or FieldCutouts.cutout",
+    "Table": "catalogue(result)",
 }
 
 
@@ -144,6 +150,19 @@ def check_instance(name, value, kind):
         f"{name} is {described(value)}, must be {' or '.join(names)}"
         + (f": give {' or '.join(ways)}" if ways else "")
     )
+
+
+def check_sequence(name, values, kind=object) -> tuple:
+    """Returns the values as a tuple. Raises ValueError for one alone, and unless all are `kind`."""
+    try:
+        values = tuple(values)
+    except TypeError:
+        raise ValueError(
+            f"{name} is {described(values)}, must be a sequence: give a list"
+        ) from None
+    for i, value in enumerate(values):
+        check_instance(f"{name}[{i}]", value, kind)
+    return values
 
 
 def described(value) -> str:
