@@ -64,9 +64,9 @@ def _lines(observation, filled):
         values = np.unique(observation.data[c][filled[c]])
         some = ", ".join(f"{value:.6g}" for value in values[:MAX_NAMED])
         lines.append(
-            f"channel {observation.channels[c]} has {filled[c].sum()} pixels of exactly {some}"
+            f"channel {observation.channels[c]} has pixels of exactly one value, which noise does "
+            f"not have, taken for pixels without data and masked: {filled[c].sum()} of {some}"
             f"{' and other values' if len(values) > MAX_NAMED else ''}, the first at (y, x) = "
-            f"({y}, {x}), which noise does not have: they are taken for pixels without data and "
-            "masked"
+            f"({y}, {x})"
         )
     return lines
