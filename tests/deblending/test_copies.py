@@ -102,7 +102,7 @@ def test_a_bad_blend_harms_no_other(device):
         "observations is empty": Blend((), SOURCES),
         "frame is 3 (int), must be Frame": Blend(observe(), SOURCES, frame=3),
         "shifts must be an array of real numbers": Blend(observe(), SOURCES, shifts="no"),
-        "TypeError": Blend(None, SOURCES),
+        "observations is None (NoneType), must be a sequence": Blend(None, SOURCES),
     }
     settings = Settings(max_iter=3)
     found = deblend_many([good, *wrong.values(), good], settings=settings, device=device)
