@@ -18,6 +18,11 @@ N_LEVELS, MIN_CONTRAST = 256, 1e-6
 # galaxies have less. In a crowd so have sources of signal to noise up to 900, so that there the
 # brightest object's light counts, if that has at most COMPACT areas of a point source.
 MIN_PART, COMPACT = 0.001, 3.0
+# [sigma] Smallest height of an object above its saddle: the noise has bumps of one.
+MIN_RISE = 2.0
+# [1] of an object's brightest pixel: its highest local maximum. sep shares out pixels between
+# objects, so that this pixel may lie on the flank of another; a sector of a disk has no maximum.
+MIN_TOP = 0.7
 # [FWHM^2] sum of a point source's image filtered with its PSF, over its peak: 4 pi sigma^2
 POINT_AREA = 2.27
 # How often sep's limits are doubled: to 32 times an image's pixels in its buffer, and to 32,768
@@ -86,31 +91,27 @@ def _without_structure(image, threshold, point_area, peaks, segments):
     """
     if len(peaks) < 2:
         return peaks, segments
-    inside = image > threshold
-    at = np.array([place for place, _ in peaks], int).reshape(-1, 2)
-    of, n = ndimage.label(inside, np.ones((3, 3)))
-    number = np.arange(len(peaks) + 1)
-    own = of[at[:, 0], at[:, 1]]
-    height = np.array([peak for _, peak in peaks])
-    base = np.maximum(_saddle_heights(image, inside, at, height), threshold)
-    above = image - np.concatenate([[0], base])[segments]
+    inside, number = image > threshold, np.arange(len(peaks) + 1)
+    tops = np.where(ndimage.maximum_filter(image, 3) == image, image, 0)
+    at = np.array(ndimage.maximum_position(tops, segments, number[1:]), int)
+    height = tops[at[:, 0], at[:, 1]].astype(float)
+    base = _saddle_heights(image, inside, at, height)
+    above = image - np.concatenate([[0], np.maximum(base, threshold)])[segments]
     light = ndimage.sum_labels(np.maximum(above, 0), segments, number)[1:]
-    number_of = np.arange(1, n + 1)
-    top = np.array(ndimage.maximum_position(light, own, number_of), int)[own - 1, 0]
+    of, n = ndimage.label(inside, np.ones((3, 3)))
+    own = of[at[:, 0], at[:, 1]] - 1
+    top = np.array(ndimage.maximum_position(light, own, np.arange(n)), int)[own, 0]
     compact = light[top] < COMPACT * point_area * height[top]
-    whole = np.where(compact, light[top], ndimage.sum_labels(image, of, number_of)[own - 1])
-    kept = light >= MIN_PART * whole
-    if kept.all():
-        return peaks, segments
+    whole = np.where(compact, light[top], ndimage.sum_labels(image, of, np.arange(n) + 1)[own])
+    kept = (light >= MIN_PART * whole) & (height >= base + MIN_RISE)
+    kept &= height >= MIN_TOP * np.array([peak for _, peak in peaks])
     number[1:] = np.where(kept, np.cumsum(kept), 0)
-    return [peaks[i] for i in np.flatnonzero(kept)], number.astype(segments.dtype)[segments]
+    found = [(at[i].astype(float), float(height[i])) for i in np.flatnonzero(kept)]
+    return found, number.astype(segments.dtype)[segments]
 
 
 def _saddle_heights(image, inside, at, height):
-    """Light (S,) of the highest saddle between each of the peaks at (S, 2) and a higher one.
-
-    Their heights where they are no local maxima.
-    """
+    """Light (S,) of the highest saddle between each of the peaks at (S, 2) and a higher one."""
     basins = watershed(image, inside, at)
     own = basins[at[:, 0], at[:, 1]] - 1
     found, parent = height.copy(), np.arange(basins.max())
