@@ -13,6 +13,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from ..sky.noise import sigma_below_zero
+
 CELL_PX = 64  # [px] of the model: several times the size of the galaxies in deep images
 MIN_CELLS = 8  # along each axis: in fewer, a bright galaxy with its neighbours may fill most
 # [sigma] of a level that is left: faint sources raise the median of blank cells
@@ -22,8 +24,7 @@ DARKEST = 0.1
 # [errors of a median] from which a negative median is a level. Left in, -0.1 of a pixel's noise
 # hides 19 of 54 galaxies of signal to noise 9 to 20, and -0.2 all of them.
 DEFICIT = 3.0
-# Error of a median over that of a mean, and median |x| of a normal distribution.
-OF_MEDIAN, HALF = 1.25, 0.674
+OF_MEDIAN = 1.25  # error of a median over that of a mean
 
 
 def level_of(image, seen):
@@ -55,8 +56,10 @@ def deficit_of(image, seen, area):
     if not values.size:
         return 0.0
     middle = float(np.median(values))
-    below = middle - values[values < middle]
-    error = OF_MEDIAN * np.sqrt(area) * (np.median(below) / HALF if below.size else 0.0)
+    scatter = sigma_below_zero(values - middle)
+    if scatter is None:  # too few pixels
+        return 0.0
+    error = OF_MEDIAN * np.sqrt(area) * scatter
     level = middle if middle < -DEFICIT * error / np.sqrt(values.size) else 0.0
     cells = _medians(image, seen) - level
     deep = cells < -DEFICIT * error / CELL_PX
