@@ -101,7 +101,7 @@ def told(process):
 
 def parts_in(out):
     """Groups of fits that are on disk."""
-    return len(list((out / "work").glob("fit-*.fits")))
+    return len(list((out / "work").glob("fit-*.arrays")))
 
 
 def kill_at(process, seconds, what, rng, number=signal.SIGKILL):

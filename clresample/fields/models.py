@@ -39,12 +39,12 @@ def write_models(path, job, parts, last, ids):
 
     HDUs: COMPONENTS, a row for each with COMPONENT_COLUMNS, offset being its first pixel in
     MORPHOLOGIES, and the spectrum; MORPHOLOGIES, one float32 array of all pixels; OFFSETS, rows of
-    Part.offsets, empty where no shift and no sky was fitted.
+    GroupResults.offsets, empty where no shift and no sky was fitted.
     """
     rows, spectra, flat, offsets = [], [], [], []
     for i, part in enumerate(parts):
-        offsets += [row for row in part.offsets() if last.get(int(row[0])) == i]
-        table, pixels, their = part.read("COMPONENTS", "MORPHOLOGIES", "SPECTRA")
+        table, pixels, their, moved = part.read("COMPONENTS", "MORPHOLOGIES", "SPECTRA", "OFFSETS")
+        offsets += [row for row in moved if last.get(int(row[0])) == i]
         numbers = np.stack([table[name] for name in COMPONENT_COLUMNS], axis=1).tolist()
         for row, spectrum in zip(numbers, their, strict=True):
             source, _, patch, *_, n_y, n_x, start = row

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable, vstack
+from astropy.table import QTable
 
 from ..fields.execution.folder import WORK
 from ..fields.execution.group_results import GroupResultsFile, last_rounds
 from ..fields.model_mosaics import file_name
 from ..files.atomic import FileError
 from ..files.tables import read_catalogue
+from ..measurement.columns import Columns
 from .instrument import Instrument, instruments_in
 
 
@@ -147,30 +148,20 @@ def _done(work):
 def _so_far(work, notes):
     """Sources and fits of the groups that are finished, the last round's of each fit."""
     parts = []
-    for path in sorted(work.glob("fit-*.fits")):
+    for path in sorted(work.glob("fit-*.arrays")):
         part = GroupResultsFile(path)
         try:
             parts.append(part.read("PATCHES", "CATALOGUE"))
-        except (FileError, KeyError) as error:
-            notes.append(f"{path.name} cannot be read ({' '.join(str(error).split())})")
+        except FileError as error:
+            notes.append(str(error))
     last, tables, fits = last_rounds([patches for patches, _ in parts]), [], []
     for i, (patches, rows) in enumerate(parts):
         mine = np.array([last[number] == i for number in patches["fit_id"].tolist()], bool)
-        fits.append(patches.select_rows(mine).table())
-        tables.append(rows.select_rows(np.repeat(mine, patches["n_sources"])).table())
-    sources, fits = (_stacked([t for t in some if len(t)]) for some in (tables, fits))
+        fits.append(patches.select_rows(mine))
+        tables.append(rows.select_rows(np.repeat(mine, patches["n_sources"])))
+    of_both = ([rows for rows in some if len(rows)] for some in (tables, fits))
+    sources, fits = (Columns.concatenate(some).table() for some in of_both)
     return (
         sources[np.argsort(sources["id"], kind="stable")] if len(sources) else sources,
         fits[np.argsort(fits["fit_id"], kind="stable")] if len(fits) else fits,
     )
-
-
-def _stacked(tables):
-    if not tables:
-        return QTable()
-    stacked = vstack(tables, join_type="outer", metadata_conflicts="silent")
-    for name in stacked.colnames:
-        if hasattr(stacked[name], "mask"):
-            filled = stacked[name].filled(np.nan) if stacked[name].dtype.kind == "f" else None
-            stacked[name] = stacked[name].unmasked if filled is None else filled
-    return stacked

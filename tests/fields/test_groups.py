@@ -225,8 +225,8 @@ def test_what_was_found_is_carried_from_round_to_round(tmp_path):
     parts.job.plan.patches = patches
     for name, found in (("fit-0-000000", rows), ("fit-1-000000", [])):
         part = GroupResults(found=found)
-        (tmp_path / f"{name}.fits").write_bytes(part.to_bytes())
+        (tmp_path / f"{name}.arrays").write_bytes(part.to_bytes())
         parts.add({name: (3, 4)})
     assert parts.found_in((4,)) == (rows[1],) and parts.found_in((3, 4)) == tuple(rows)
-    (table,) = GroupResultsFile(tmp_path / "fit-0-000000.fits").read("FOUND")
+    (table,) = GroupResultsFile(tmp_path / "fit-0-000000.arrays").read("FOUND")
     assert table["host"].tolist() == [5, 78]

@@ -144,7 +144,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run_field(mosaics, tmp_path, progress=stop)
     assert stop.predicted_s is not None and 0 <= stop.predicted_s < 3600
-    parts = sorted((tmp_path / "work").glob("fit-*.fits"))
+    parts = sorted((tmp_path / "work").glob("fit-*.arrays"))
     assert len(parts) == 1 and not (tmp_path / "catalogue.fits").exists()
     before = parts[0].stat().st_mtime_ns
     with pytest.raises(FileError, match="--resume goes on"):
@@ -153,7 +153,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
     with pytest.raises(FileError, match=r"another threshold, 5.0 and not 6.0"):
         run_field(mosaics, tmp_path, options=other, resume=True)
     n_most = 1 << 22  # numbers of processes lie below
-    left = tmp_path / "work" / f".part-{HOST}-{n_most}-0a" / "fit-x.fits"  # killed as it wrote
+    left = tmp_path / "work" / f".part-{HOST}-{n_most}-0a" / "fit-x.arrays"  # killed as it wrote
     left.parent.mkdir()
     left.write_bytes(parts[0].read_bytes()[:100])
     run_field(mosaics, tmp_path, resume=True)
@@ -226,7 +226,7 @@ def test_later_rounds_keep_the_components_and_go_on_from_their_profiles(cut):
 def test_rounds_that_are_resumed_end_with_the_same_bytes(cut, done, sky, tmp_path):
     """They go on from the profiles in the files of the round before."""
     folder = shutil.copytree(cut[0], tmp_path / "again")
-    later = sorted((folder / "work").glob("fit-[1-9]*.fits"))
+    later = sorted((folder / "work").glob("fit-[1-9]*.arrays"))
     assert later
     for path in later:
         path.unlink()

@@ -118,7 +118,7 @@ def test_pulls_and_completeness_are_those_of_the_truth(done, sky, tmp_path):
 def test_an_unfinished_run_shows_what_is_done(done, tmp_path):
     folder, _ = done
     shutil.copytree(folder / "work", tmp_path / "work")
-    parts = sorted((tmp_path / "work").glob("fit-*.fits"))
+    parts = sorted((tmp_path / "work").glob("fit-*.arrays"))
     rows = len(QTable.read(folder / "catalogue.fits"))
     _, data, text = page_of(tmp_path)
     assert "This run has not finished" in text and data["instruments"] == []

@@ -415,7 +415,7 @@ def _add_columns(rows, ids, job, patch, status, reason):
 
 def _line(error):
     """An error as FITS tables hold it."""
-    return _ascii(str(error) or type(error).__name__)[:190]
+    return _ascii(str(error) or type(error).__name__)[:190].rstrip()
 
 
 def _ascii(text):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...sky.box import Box
 from ..blends.cutouts import cutouts_box
-from .group_results import GroupResultsFile
+from .group_results import results_file
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def gather_inputs(job, group) -> GroupInputs:
         of_file.setdefault(name, {})[number] = job.plan.patches[number].box[:2]
     before: dict[int, tuple[dict, dict]] = {}
     for name, corners in of_file.items():
-        before |= GroupResultsFile(job.folder / f"{name}.fits").last_fits(corners)
+        before |= results_file(job.folder, name).last_fits(corners)
     return GroupInputs(labels, None if group.round == 0 else _light(job, group), before)
 
 
@@ -76,7 +76,7 @@ def _light(job, group):
         shares.setdefault(name, {})[patch] = share
     models: dict[int, list] = {}
     for name, of_patch in sorted(shares.items()):
-        for patch, i, box, model in GroupResultsFile(job.folder / f"{name}.fits").models(of_patch):
+        for patch, i, box, model in results_file(job.folder, name).models(of_patch):
             models.setdefault(patch, []).append((i, box, of_patch[patch] * model))
     found = {}
     for number in group.patches:

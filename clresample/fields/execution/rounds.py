@@ -13,7 +13,7 @@ from ...files.atomic import FileError
 from ..blends.plan import predicted_cost
 from .fitting import fit_group, is_large, mark_failed
 from .group_inputs import FitGroup, gather_inputs
-from .group_results import FOUND_COLUMNS, GroupResultsFile
+from .group_results import FOUND_COLUMNS, GroupResultsFile, results_file
 from .search_setup import read_search_setup
 from .tasks import TaskKind
 from .time_left import TimeLeft, remember_pace, remembered_pace
@@ -37,7 +37,7 @@ SETTLED_PART = 0.005
 
 def part_path(job, group):
     """Path of the results of a group."""
-    return job.folder / f"{group.name}.fits"
+    return results_file(job.folder, group.name).path
 
 
 FIT = TaskKind(gather_inputs, fit_group, part_path)
@@ -91,7 +91,7 @@ def fit_all_groups(job, engine, progress):
         if len(history.names[n]) > 2 and pending.intersection(job.plan.patches[n].siblings)
     }
     # sorted by name, so that sums of models do not depend on the order in which the groups ended
-    return [_file(job, name) for name in sorted(parts)], unsettled
+    return [results_file(job.folder, name) for name in sorted(parts)], unsettled
 
 
 def _without_waiting(job, pending):
@@ -110,10 +110,6 @@ def _name(n_round, i):
     return f"fit-{n_round}-{i:06d}"
 
 
-def _file(job, name):
-    return GroupResultsFile(job.folder / f"{name}.fits")
-
-
 class _PieceHistory:
     """The files of results of a cut blend's pieces, round by round."""
 
@@ -123,7 +119,7 @@ class _PieceHistory:
     def add(self, names):
         """Adds a round: {name: patches} of its parts."""
         for name in sorted(names):
-            (table,) = _file(self.job, name).read("FOUND")
+            (table,) = results_file(self.job.folder, name).read("FOUND")
             for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
                 self.found.setdefault(row[0], []).append(row)
             for patch in names[name]:
@@ -182,8 +178,8 @@ class _PieceHistory:
         for patch, name in pairs:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
-            part = _file(self.job, name)
-            rows, where = part.read("CATALOGUE")[0], dict(part.owners())
+            rows, parts = results_file(self.job.folder, name).read("CATALOGUE", "COMPONENTS")
+            where = dict(zip(parts["id"].tolist(), parts["fit_id"].tolist(), strict=True))
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
@@ -262,7 +258,7 @@ def _cost(job, group):
 def _parts_of(folder):
     """{name: patches} of the parts on disk."""
     found = {}
-    for path in sorted(folder.glob("fit-*.fits")):
+    for path in sorted(folder.glob("fit-*.arrays")):
         (patches,) = GroupResultsFile(path).read("PATCHES")
         found[path.stem] = tuple(patches["fit_id"].tolist())
     return found
