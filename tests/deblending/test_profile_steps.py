@@ -124,10 +124,14 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pi
     """
     fit, looking = valley([1.9, 1.9, 3.4, 0.5, 1.9, 0.5])
     begun: list[int] = []
+
+    def second_start(fit, scenes):
+        begun.extend(scenes)
+        fit._step(scenes)
+
     monkeypatch.setattr(looking, "n_pixels", lambda: np.full(6, n_pixels))
     monkeypatch.setattr(fit.expected, "galaxies", np.ones((6, 1), bool))
-    second_start = "_run_from_large_galaxies"
-    monkeypatch.setattr(profile_fit, second_start, lambda _, scenes: begun.extend(scenes))
+    monkeypatch.setattr(profile_fit, "_run_from_large_galaxies", second_start)
     before = looking.n_looks.copy()
     profile_fit.start_from(fit, {0: [1.8, 0, 0, 0], 2: [1.8, 0, 0, 0], 3: [-1.5, 0, 0, 0]})
     fit.run()

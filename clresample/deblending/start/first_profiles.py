@@ -2,8 +2,8 @@
 
 The first start is from the expected profiles, galaxies of a few pixels. If one galaxy of a scene is
 far larger, small profiles of all sources share its light at first, and each grows into it.
-Where one grew (profile_fit.MAX_GROWTH), sizes GROWTH times apart, with the expected wings and with
-WIDE_WINGS, are compared by
+Where one grew, the first start ends (profile_fit._have_grown). Sizes GROWTH times apart, with the
+expected wings and with WIDE_WINGS, are compared by
 
     gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (NEIGHBOUR_MODEL_ERROR <u_k, M>)^2),
 

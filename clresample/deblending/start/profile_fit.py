@@ -30,10 +30,6 @@ N_FIRST_STEPS = 5
 # beyond 0.74 and 1.06, but six of real COSMOS galaxies are, of which one has a second start. Second
 # starts that differed from first ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
 MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
-# A galaxy has grown by itself if it is larger than expected by this in ln sigma, half of a step of
-# the grid of sizes. Of 30 scenes with large galaxies (bench.ladder, seed 77) second starts gained
-# 6 in chi2 at most where the large galaxies were those that had grown, but for one.
-MIN_GROWTH = 0.5 * np.log(GROWTH)
 
 
 class ProfileFit:
@@ -85,7 +81,7 @@ class ProfileFit:
     def run(self):
         """Steps to the end, from two starts if galaxies are large; sets faint ones from grids."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        self._step(np.flatnonzero(some), learn=True)
+        self._step(np.flatnonzero(some), learn=True, until_grown=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
@@ -150,9 +146,10 @@ class ProfileFit:
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
-    def _step(self, scenes, n_steps=N_STEPS, tol=None, *, learn=False):
+    def _step(self, scenes, n_steps=N_STEPS, tol=None, *, learn=False, until_grown=False):
         """Step until some scenes have ended; tol: least gain, measured or expected; None: self.tol.
 
+        until_grown: a scene also ends when one of its galaxies is GROWTH times as large as it began
         learn: update the prior after each step, of each scene until that takes back what the step
         gained: the doubt about a galaxy and its neighbours may alternate without an end. Chi2 is
         of the doubt at the end.
@@ -173,6 +170,8 @@ class ProfileFit:
             gained = gain > 0
             last = _is_last(gain, promised[on], tol)
             live[scenes] = steps.take(scenes, gain, promised[on]) & ~last
+            if until_grown:
+                live &= ~_have_grown(self)
             if gained.any():
                 self._take_equations(scenes[gained])
             some = scenes[gained & live[scenes] & learning[scenes]]
@@ -281,6 +280,11 @@ def _growth(fit, begun=None):
     return (fit.theta - begun)[..., 0] * fit.expected.galaxies
 
 
+def _have_grown(fit):
+    """Selects scenes (B,) with a galaxy GROWTH times as large as it began."""
+    return _growth(fit, fit.begun).max(axis=1) > np.log(GROWTH)
+
+
 def _may_hold_large_galaxies(fit):
     """Selects scenes (B,) that may hold large galaxies, or whose data are unexplained.
 
@@ -295,24 +299,20 @@ def _run_from_large_galaxies(fit, scenes):
     """Fits scenes (k,) of a ProfileFit again from profiles of large galaxies.
 
     The better fit of each stays. Scenes in which no larger profile has more of the light keep the
-    first fit; where the large galaxies are those that grew in it, or some of an earlier fit's, it
-    goes on with less doubt.
+    first one, which goes on with less doubt where it was ended because a galaxy had grown.
     """
     before, chi2 = fit._copy(), fit._chi2_as_expected(scenes)
-    grown = _growth(fit)[scenes] > MIN_GROWTH
+    grown = _have_grown(fit)[scenes]
     fit.theta[scenes] = fit.expected.mean[scenes]
     fit.population.reset(scenes, fit.expected)
     fit.population.own_light[scenes] = OWN_LIGHT
     fit._look(scenes, fit.theta, slopes=False)
     fit.looking.solve(MODEL_ERROR)
-    large = first_profiles(fit, scenes, MODEL_ERROR)[scenes]
-    some, same = large.any(axis=1), (large == grown).all(axis=1)
-    same |= fit.is_known[scenes] & (large <= grown).all(axis=1)
-    fit._restore(before, scenes[same | ~some])
+    some = first_profiles(fit, scenes, MODEL_ERROR)[scenes].any(axis=1)
     _go_on_with_less_doubt(fit, scenes[some])
-    worse = scenes[some & ~(fit._chi2_as_expected(scenes) < chi2)]
-    fit._restore(before, worse)
-    _go_on_with_less_doubt(fit, worse)
+    better = some & (fit._chi2_as_expected(scenes) < chi2)
+    fit._restore(before, scenes[~better])
+    _go_on_with_less_doubt(fit, scenes[~better & (some | grown)])
 
 
 def _go_on_with_less_doubt(fit, scenes):
