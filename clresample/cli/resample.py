@@ -153,6 +153,7 @@ def run(arguments):
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))
+    from ..fields.field_toml.headers import AREAS
     from ..files.atomic import atomic_files
     from ..files.fits import read_image, write_fits  # a quarter of a second of astropy
 
@@ -161,7 +162,7 @@ def run(arguments):
     reference = read_image(arguments.like, hdu=arguments.like_hdu, bands=arguments.like_band)
     psfs = [_psf(arguments, which, len(pixels)) for which in ("psf", "psf_like")]
     unit = str(image.header.get("BUNIT") or "")
-    if "sr" in unit.lower() or "arcsec" in unit.lower():
+    if any(area in unit.lower() for area in AREAS):
         print_note(
             arguments, f"{arguments.image}: BUNIT is {unit}, but pixels are taken as flux per pixel"
         )

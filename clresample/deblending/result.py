@@ -29,7 +29,7 @@ class Component:
     morphology (ny, nx) [1]: max = 1, under the model's PSF
     spectrum (C,) [counts]: flux per model pixel where the morphology is 1, over all channels of all
         observations in their order, each in its own observation's counts; 0 in a channel without
-        any data, whose fluxes are NaN, see `fluxes`
+        any data. Where a flux is NaN (`fluxes`) it describes no more than the wings on its pixels
 
     The covariance of all spectra is Result.covariance.
     """

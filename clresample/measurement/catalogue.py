@@ -62,7 +62,7 @@ FLAG_MEANINGS = {
     Flag.NOT_CONVERGED: "the blend's fit did not converge, and this flux changed by over 0.2 of "
     "its error in the last half of the iterations, by an unknown part, or at a wrong model",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
-    Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
+    Flag.NO_COVERAGE: "a channel's image does not hold the centre, or hardly any of the light",
     Flag.OUTSIDE_FRAME: "outside the frame, thus not fitted: nothing is measured",
     Flag.CENTER_MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
     Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
@@ -98,8 +98,8 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
             for stars. They, and those of fluxes, are larger for misfitted sources, see `Errors`
         flux_*, flux_err_* per band, or per channel if the observation has no `bands`; the
             exposures of a band have one flux, see `fluxes`. The unit is that of the data if all
-            observations have the same, else uJy if they have zero points, else counts. NaN if no
-            pixel of the band determines it
+            observations have the same, else uJy if they have zero points, else counts. NaN if the
+            band's pixels with weight hold under 5 % of the light (0.1 % of a star's)
         mag_*, mag_err_* per band [mag, AB]: where the flux is positive
         colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of neighbouring bands A and B; the error
             follows from the covariance of the two fluxes to first order, see

@@ -25,8 +25,9 @@ def fluxes(result):
 
     result: a fitted blend
     returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
-        where a channel does not determine a flux, as one without weights, and for sources without
-        components; their covariances with others are 0
+        where a channel does not determine a flux, as one whose pixels with weight hold under 5 % of
+        the light (0.1 % of a star's), and for sources without components; their covariances with
+        others are 0
     """
     check_instance("result", result, Result)
     sums = np.zeros((len(result.sources), len(result.components)))

@@ -99,16 +99,17 @@ def test_psf_sampling_and_centre(files):
         np.testing.assert_allclose(moved, plain, rtol=0, atol=1e-4 * plain.max())
 
 
-def test_notes_are_one_line_each(files, capsys):
+@pytest.mark.parametrize("unit", ["MJy/sr", "Jy/beam"])
+def test_notes_are_one_line_each(unit, files, capsys):
     fits.writeto("moved.fits", np.pad(fits.getdata("p.fits"), ((4, 0), (0, 2))))
     assert resample(psf="moved.fits") == 0
     (line,) = capsys.readouterr().err.splitlines()
     assert "note: moved.fits: PSF core off the centre" in line and "--psf-center core" in line
     with fits.open("in.fits") as hdus:
-        hdus[0].header["BUNIT"] = "MJy/sr"
+        hdus[0].header["BUNIT"] = unit
         hdus.writeto("surface.fits")
     assert resample("--overwrite", image="surface.fits") == 0
-    assert "BUNIT is MJy/sr" in capsys.readouterr().err
+    assert f"BUNIT is {unit}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("unit", [True, 5, "x" * 60])

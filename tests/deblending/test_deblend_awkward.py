@@ -6,6 +6,7 @@ from helpers.scenes import BRIGHT, FLUX, GALAXIES, SHAPE, blend, chi2, fit, fram
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.settings import Settings
+from clresample.measurement.photometry import fluxes
 from clresample.sky.frame import Frame
 from clresample.sky.observation import Observation
 from clresample.sky.sources import ExtendedSource, PointSource
@@ -166,6 +167,19 @@ def test_a_channel_without_weights(device, plain):
     assert np.isinf(np.diagonal(result.covariance[1])).all()
     assert np.isfinite(result.covariance[[0, 2]]).all()
     assert np.isnan(result.residual(1)[0]).all() and np.isfinite(result.residual(1)[1]).all()
+
+
+def test_a_channel_without_weights_at_one_source(device, plain):
+    """It has no flux there, however bright the wings of the fit; the other source has one."""
+    b = blend(BRIGHT)
+    x = plain.footprints[1].positions[..., 1]
+    blind = b.observations[1].weights * np.stack([x > 20, np.ones(x.shape)])
+    observations = b.observations[0], reweighted(b.observations[1], blind)
+    flux, covariance = fluxes(deblend(observations, b.sources, frame=b.frame, device=device))
+    expected = np.array([[False, True, False], [False, False, False]])
+    np.testing.assert_array_equal(np.isnan(flux), expected)
+    np.testing.assert_array_equal(np.isnan(covariance[:, [0, 1], [0, 1]].T), expected)
+    np.testing.assert_allclose(flux[1], fluxes(plain)[0][1], rtol=0.1)
 
 
 def test_no_weights_at_all_are_refused(device):

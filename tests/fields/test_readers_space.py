@@ -90,7 +90,7 @@ def test_the_correlation_of_drizzled_noise_is_estimated(tmp_path):
     ("given", "message"),
     [
         ({}, "psf of band F814W is missing, files of HST hold none: give psf"),
-        ({"psf": PSF_OF, "cards": {"PHOTFLAM": 0.0}}, "has no PHOTFLAM and PHOTPLAM: give zero"),
+        ({"psf": PSF_OF, "cards": {"PHOTFLAM": 0.0}}, "has no PHOTFLAM and PHOTPLAM .*: give zero"),
     ],
 )
 def test_what_hst_lacks_is_asked_for(tmp_path, given, message):

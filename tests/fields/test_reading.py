@@ -270,12 +270,29 @@ def test_a_package_that_is_not_there_is_one_line(files, capsys, monkeypatch):
         ({"BUNIT": "MJy/sr", "PIXAR_SR": 1e-14}, 8.9 + 20.0),
         # F814W of ACS: PHOTFLAM 7.03e-20, PHOTPLAM 8045: AB 25.94
         ({"PHOTFLAM": 7.0332e-20, "PHOTPLAM": 8045.5}, 25.947),
+        # and of electrons of all of an exposure, which are those of a second times its seconds
+        (
+            {"PHOTFLAM": 7.0332e-20, "PHOTPLAM": 8045.5, "BUNIT": "ELECTRONS/S", "EXPTIME": 100.0},
+            25.947,
+        ),
+        (
+            {"PHOTFLAM": 7.0332e-20, "PHOTPLAM": 8045.5, "BUNIT": "ELECTRONS", "EXPTIME": 100.0},
+            30.947,
+        ),
+        ({"PHOTFLAM": 7.0332e-20, "PHOTPLAM": 8045.5, "BUNIT": "ELECTRONS"}, None),
+        ({"MAGZERO": 24.6, "BUNIT": "ELECTRONS", "EXPTIME": 100.0}, 24.6),
         ({"EXPTIME": 3.0}, None),
     ],
 )
 def test_zero_points_of_headers(cards, expected):
     found = zero_point(fits.Header(cards), 0.1)
     assert found is None if expected is None else abs(found - expected) < 2e-3
+
+
+@pytest.mark.parametrize("unit", ["Jy/beam", "JY BEAM-1", "mag/arcsec^2", "mJy/sr", "nJy arcsec-2"])
+def test_surface_brightness_is_refused(unit):
+    with pytest.raises(ValueError, match="BUNIT is .* must be a flux per pixel: multiply"):
+        zero_point(fits.Header({"BUNIT": unit, "MAGZERO": 25.0}), 0.1)
 
 
 def test_bits_by_number_and_name():

@@ -4,6 +4,7 @@ import numpy as np
 
 from clresample.deblending.ended import Ended
 from clresample.deblending.result import Component, Result
+from clresample.sky.footprint import Footprint
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -46,6 +47,15 @@ def in_frame(component, shape):
     return image
 
 
+def on_pixels(component, observation, grid, shift):
+    """The light (Co, My, Mx) of a component of a frame on this grid, as points."""
+    footprint = Footprint(observation, observation.grid.map_to(grid), np.asarray(shift))
+    held, pixels = footprint.nearest_pixels(np.stack(np.indices(grid.shape), axis=-1))
+    image = np.zeros(observation.shape)
+    np.add.at(image, (slice(None), *pixels[:, held]), in_frame(component, grid.shape)[held])
+    return image
+
+
 def blend(components, *, observations=None, sources=None, grid=None, **given):
     """A result, on the frame's own pixels where nothing else is rendered.
 
@@ -65,16 +75,17 @@ def blend(components, *, observations=None, sources=None, grid=None, **given):
         )
     n, n_channels = len(components), sum(len(o.channels) for o in observations)
     images = np.array([in_frame(c, grid.shape) for c in components]).reshape(n, *grid.shape)
+    shifts = given.get("shifts", np.zeros((len(observations), 2)))
     fields = {
         "rendered": tuple(
             np.repeat(images[:, None], len(o.channels), axis=1)
             if o.grid.shape == grid.shape
-            else np.zeros((n, *o.shape))
-            for o in observations
+            else np.array([on_pixels(c, o, grid, shift) for c in components])
+            for o, shift in zip(observations, shifts, strict=True)
         ),
         "sky": np.zeros(n_channels),
         "covariance": np.tile(np.eye(n), (n_channels, 1, 1)),
-        "shifts": np.zeros((len(observations), 2)),
+        "shifts": shifts,
         "losses": np.array([100.0, 10.0, 9.0]),
         "status": Ended.CONVERGED,
     }

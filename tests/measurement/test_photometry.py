@@ -1,6 +1,7 @@
 """Fluxes, their covariances and shares of the data, against closed forms."""
 
 import numpy as np
+import pytest
 from astropy import units as u
 from helpers.blends import (
     MIDDLE,
@@ -15,6 +16,7 @@ from clresample.deblending.posterior.errors import Errors
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import channel_covariances, fluxes, redistribute
 from clresample.sky.grid import Grid
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def test_fluxes_add_up_over_components_with_their_covariances():
@@ -87,6 +89,31 @@ def test_fluxes_that_a_channel_does_not_determine_are_unknown():
     error = np.sqrt(1.1 * (a**2 + b**2) + 0.2 * a * b)
     np.testing.assert_allclose(table["snr"][0], (a + 3 * b) / error, rtol=1e-13)
     np.testing.assert_allclose(fluxes(result)[1][0], [[np.nan, 0], [0, 1.1 * c**2]])
+
+
+@pytest.mark.parametrize(
+    "first, kind, n_exposures, known",
+    [  # columns from `first` on, 2 to 6 px from the centre, hold 16, 5, 0.1 and 0.01 % of the light
+        (37, ExtendedSource, 1, True),
+        (38, ExtendedSource, 1, False),
+        (38, ExtendedSource, 2, True),  # exposures of one band
+        (40, PointSource, 1, True),
+        (41, PointSource, 1, False),
+    ],
+)
+def test_pixels_with_hardly_any_of_the_light_determine_no_flux(first, kind, n_exposures, known):
+    grid, weights = Grid.flat((60, 70), SCALE), np.full((60, 70), 1e-12)
+    weights[:, :first] = 0
+    observations = [observe(grid, ("g",), weights=1e-12)]
+    observations += [
+        observe(grid, (f"r{i}",), weights=weights, bands=("r",)) for i in range(n_exposures)
+    ]
+    given = {"observations": observations, "sources": [kind(position_px=MIDDLE)]}
+    result = blend([round_component(0, MIDDLE, np.ones(1 + n_exposures))], **given)
+    table = catalogue(result)
+    assert np.isfinite([table["flux_r"][0].value, table["flux_err_r"][0].value]).all() == known
+    assert np.isfinite(table["flux_g"][0].value)
+    assert bool(table["flags"][0] & Flag.NO_COVERAGE) != known
 
 
 def test_shares_add_up_to_the_data_in_the_models_proportions():

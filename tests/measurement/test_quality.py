@@ -32,14 +32,14 @@ def test_chi2_in_the_box_counts_weighted_pixels_of_the_box_only():
 
 @pytest.mark.parametrize("angle_deg, shift", [(0, (0, 0)), (30, (0, 0)), (30, (3.0, -2.0))])
 def test_boxes_are_projected_by_the_mapping_and_the_shift(angle_deg, shift):
-    """Residual 1 where the pixel's true place is in the box, huge elsewhere."""
+    """Data of 1 where the pixel's true place is in the box, huge elsewhere."""
     grid = Grid.flat((60, 70), SCALE)
     coarse = Grid.flat((20, 22), 0.3, angle_deg=angle_deg, flip=True)
     y, x = np.array([29.5, 34.5])[:, None, None] + coarse.sky(*np.indices(coarse.shape)) / SCALE
     y, x = y + shift[0], x + shift[1]
     inside = (y >= 19.5) & (y < 40.5) & (x >= 24.5) & (x < 45.5)
     observation = observe(coarse, ("g",), data=np.where(inside, 1.0, 1e3), weights=2.0)
-    component = round_component(0, MIDDLE, (1.0,))
+    component = round_component(0, MIDDLE, (0,))
     result = blend([component], grid=grid, observations=(observation,), shifts=np.array([shift]))
     np.testing.assert_allclose(catalogue(result)["chi2_observation0"], 2.0, rtol=1e-13)
 

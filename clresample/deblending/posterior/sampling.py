@@ -6,6 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...sky.sources import PointSource
+from ..component_images import image_within, window_of
+from ..linear.ties import Ties
+
+# [1] Least part of a component's light on pixels with weight of a band that determines its flux.
+# Of galaxies with less, in simulated images that lack a band beside them, 7 in 100 fluxes are over
+# 5 errors off, up to 3e5 times the truth, as errors of wings far below the noise are unknown; one
+# in 50 with 1 to 5 %, which have a signal to noise over 5 as rarely; none with 5 to 20 %.
+MIN_LIGHT = 0.05
+# The same of a star, whose wings are its PSF's: fluxes of stars with masked cores that leave 0.2 to
+# 17 % of the light are within two errors.
+MIN_STAR_LIGHT = 1e-3
+
 
 def drawn_components(result, rng):
     """One draw of all components, morphologies and spectra 0 or more; see `Result.sample`.
@@ -47,17 +60,36 @@ def drawn_fluxes(result, n, rng):
 
 
 def undetermined(result) -> np.ndarray:
-    """Fluxes (S, C) bool that nothing determines: channels without data, sources not fitted.
+    """Fluxes (S, C) bool that no data determine: with too little light on pixels, or not fitted.
 
-    A component that is zero everywhere does not contribute to its source's flux.
+    Of each component with light MIN_LIGHT, MIN_STAR_LIGHT of stars, must be on pixels with weight,
+    of any exposure of the band. The wings of a model do not determine the flux of what is beyond.
     """
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     lost = np.ones((len(result.sources), len(result.channels)), bool)
     owner = np.array([c.source for c in result.components], int)
     lost[owner] = False
+    seen = light_on_pixels(result)
     for i, c in enumerate(result.components):
+        star = isinstance(result.sources[c.source], PointSource)
         if c.morphology.any() or (
             result.errors is not None and result.errors.outside_box_moments[i, 0]
         ):
-            lost[c.source] |= ~known[:, i]
+            lost[c.source] |= ~known[:, i] | (seen[i] < (MIN_STAR_LIGHT if star else MIN_LIGHT))
     return lost
+
+
+def light_on_pixels(result) -> np.ndarray:
+    """Fraction (n, C) of each component's light on pixels with weight, of all exposures of a band.
+
+    Their fractions are added: two exposures that have all of it give 2.
+    """
+    seen = np.zeros((len(result.components), len(result.channels)))
+    parts = zip(result.channel_slices(), result.rendered, result.footprints, strict=True)
+    for channels, rendered, footprint in parts:
+        for i, c in enumerate(result.components):
+            window = window_of(rendered, i)
+            image = image_within(rendered, i, window) * footprint.used[:, *window]
+            seen[i, channels] = image.sum((1, 2), dtype=np.float64) / max(c.morphology.sum(), 1e-30)
+    ties = Ties.of([band for o in result.observations for band in o.bands])
+    return seen if ties is None else ties.spread(ties.total(seen))

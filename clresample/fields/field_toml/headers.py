@@ -11,15 +11,21 @@ ZERO_POINTS = "MAGZERO", "MAGZPT", "MAGZP", "PHOTZP", "ZEROPNT", "MAG_ZERO"
 BIT_PREFIX = "MP_"  # of Rubin's and HSC's masks: MP_SAT = 1 means that bit 1 is SAT
 LAST_BIT = 62  # of masks, which are read as integers of 64 bits with a sign
 STERADIAN_ARCSEC2 = (180 / math.pi * 3600) ** 2
+AREAS = "beam", "arcsec", "sr"  # in a BUNIT: of a surface brightness, whose sum is no flux
+TOTALS = "electrons", "electron", "e-", "counts", "count", "dn", "adu"  # BUNITs of a whole exposure
 
 
 def zero_point(header, pixel_scale_arcsec) -> float | None:
     """AB magnitude of one count [mag] from a header, or None.
 
     By BUNIT: nJy, uJy, Jy, nanomaggies, and MJy/sr with the pixels' area; by FLUXMAG0, the counts
-    of magnitude 0; by PHOTFLAM and PHOTPLAM of HST; by a card of ZERO_POINTS, taken as AB.
+    of magnitude 0; by PHOTFLAM and PHOTPLAM of HST, of one count a second, and by EXPTIME for a
+    BUNIT of TOTALS; by a card of ZERO_POINTS, taken as AB.
+
+    Raises ValueError for a BUNIT of any other surface brightness, such as Jy/beam.
     """
-    unit = str(header.get("BUNIT", "")).strip().lower().replace(" ", "")
+    text = str(header.get("BUNIT", "")).strip().replace(" ", "")
+    unit = text.lower()
     named = {
         "njy": NANOJANSKY,
         "ujy": MICROJANSKY,
@@ -31,15 +37,21 @@ def zero_point(header, pixel_scale_arcsec) -> float | None:
     }
     if unit in named:
         return named[unit]
-    if unit == "mjy/sr":
+    if unit == "mjy/sr" and text[0] == "M":
         area = header.get("PIXAR_SR") or pixel_scale_arcsec**2 / STERADIAN_ARCSEC2
         return JANSKY - 2.5 * math.log10(1e6 * float(area))
+    if any(area in unit for area in AREAS):
+        raise ValueError(
+            f"BUNIT is {text}, must be a flux per pixel: multiply the pixels and their errors by "
+            "the area of a pixel (of values per beam: over that of the beam), and change BUNIT"
+        )
     if _positive(header, "FLUXMAG0"):
         return 2.5 * math.log10(float(header["FLUXMAG0"]))
-    if _positive(header, "PHOTFLAM") and _positive(header, "PHOTPLAM"):
-        # Bohlin et al. 2011 (AJ 141, 173); of counts a second
-        flam, plam = float(header["PHOTFLAM"]), float(header["PHOTPLAM"])
-        return -2.5 * math.log10(flam) - 5 * math.log10(plam) - 2.408
+    cards = ["PHOTFLAM", "PHOTPLAM", *(["EXPTIME"] if unit in TOTALS else [])]
+    if all(_positive(header, card) for card in cards):
+        # Bohlin et al. 2011 (AJ 141, 173)
+        flam, plam, *seconds = (float(header[card]) for card in cards)
+        return -2.5 * math.log10(flam / math.prod(seconds)) - 5 * math.log10(plam) - 2.408
     for card in ZERO_POINTS:
         if isinstance(header.get(card), int | float):
             return float(header[card])

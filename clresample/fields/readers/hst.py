@@ -19,8 +19,6 @@ Source: the DrizzlePac Handbook, and the ACS and WFC3 data handbooks (STScI).
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ...files.atomic import FileError
@@ -72,12 +70,6 @@ def _band(path, given):
     if "DQ" in names:
         mask, flags = matching_plane(grid, path, "DQ")
         value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
-    point = zero_point(header, grid.pixel_scale_arcsec)
-    unit = str(header.get("BUNIT", "")).upper().replace(" ", "")
-    if point is not None and unit in ("ELECTRONS", "COUNTS", "DN", "ELECTRON"):
-        if not header.get("EXPTIME"):
-            raise ValueError(f"EXPTIME of {path.name} is missing, BUNIT is {unit}: give zero_point")
-        point += 2.5 * math.log10(float(header["EXPTIME"]))
     return BandFiles(
         band,
         grid,
@@ -86,8 +78,8 @@ def _band(path, given):
         kind,
         mask,
         value,
-        point,
-        missing_zero_point="the header has no PHOTFLAM and PHOTPLAM",
+        zero_point(header, grid.pixel_scale_arcsec),
+        missing_zero_point="the header has no PHOTFLAM and PHOTPLAM (and EXPTIME for total counts)",
         missing_psf="files of HST hold none",
         files=files,
     )
