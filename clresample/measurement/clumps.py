@@ -80,6 +80,8 @@ class Body:
     center (2,) [px]: (y, x); level [sigma]: of its highest isophote of the least area
     light [sigma]: all of its light as the peak of a point source; outline: (slices, mask) of it
     clump [1]: contrast up to which peaks are its structure, 0 of a faint one
+    group: number of the body in whose group it is, of those of one outline: its own, or that of the
+        brightest nucleus if its own one rises from their light by less than a clump may
     """
 
     center: np.ndarray
@@ -87,6 +89,7 @@ class Body:
     light: float
     outline: tuple
     clump: float
+    group: int
 
     @property
     def radius(self) -> float:
@@ -103,6 +106,16 @@ class Body:
         (rows, columns), mask = self.outline
         y, x = np.rint(position).astype(int) - [rows.start, columns.start]
         return bool(0 <= y < mask.shape[0] and 0 <= x < mask.shape[1] and mask[y, x])
+
+    def encloses(self, position, image):
+        """Returns True if a peak at (2,) [px] of an image is of its group, in its light or a hole.
+
+        A ring's middle has a body of its own, beyond a dark gap.
+        """
+        where, mask = self.outline
+        above = float(image[tuple(np.rint(position).astype(int))]) - self.level
+        filled = replace(self, outline=(where, ndimage.binary_fill_holes(mask)))
+        return filled.contains(position) and self.takes(above, self.level)[1]
 
     def takes(self, above, base):
         """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.
@@ -202,9 +215,10 @@ def bodies_of(image, places, fwhm_px, threshold, scale, *, least=BODY_AREA) -> B
         )
         is_peak = (at[members] == center).all(axis=1).any()
         centers = [center, *nuclei] if is_peak or not nuclei else nuclei
-        parts = _divided(image, outline, centers, level, point, CHANCE * scale**2, bright)
-        found += parts
-        of_tree += [(members, range(len(found) - len(parts), len(found)))]
+        chance, n_found = CHANCE * scale**2, len(found)
+        own = at[members], base[members]
+        found += _divided(image, outline, centers, level, point, chance, bright, own, n_found)
+        of_tree += [(members, range(n_found, len(found)))]
     owners, structure = np.full(n, -1), np.zeros(n, bool)
     apart = np.ones(n, bool)
     for members, parts in of_tree:
@@ -252,23 +266,28 @@ def _nuclei(image, basins, where, at, base, point):
     return found
 
 
-def _divided(image, outline, centers, level, point, chance, bright):
+def _divided(image, outline, centers, level, point, chance, bright, peaks, first):
     """The Bodies of an outline, one of each centre (2,) [px]: its pixels nearest to that.
 
     level [sigma]: of all; point [px]: area of a point source's image; chance [px^-2]: of sources
-    by chance; bright: whether peaks on them can be structure
+    by chance; bright: whether peaks on them can be structure; peaks: places (k, 2) [px] and bases
+    (k,) [sigma] of all; first: number of the first Body
     """
     where, mask = outline
     centers = np.unique(centers, axis=0)
     y, x = np.indices(mask.shape)
     away = [np.hypot(y + where[0].start - c[0], x + where[1].start - c[1]) for c in centers]
     nearest = np.argmin(away, axis=0)
+    heights = image[tuple(np.rint(centers).astype(int).T)]
+    places, bases = peaks
     found = []
     for i, center in enumerate(centers):
+        base = bases[(places == center).all(axis=1)].max(initial=0.0)
+        group = int(heights.argmax()) if heights[i] < (1 + CLUMP) * base else i
         own = mask & (nearest == i)
         clump = CLUMP / max(1.0, chance * mask.sum()) if bright else 0.0
         light = float(image[where][own].sum()) / point
-        found.append(Body(center, level, light, (where, own), clump))
+        found.append(Body(center, level, light, (where, own), clump, first + group))
     return found
 
 

@@ -82,8 +82,12 @@ class Search:
         small = small_bodies_of(image, np.array(self.positions)[free], *given)
         owners = large.owners.copy()
         owners[free] = np.where(small.owners < 0, -1, small.owners + len(large.bodies))
-        bodies = (*large.bodies, *small.bodies)
-        self.bodies = replace(large, bodies=bodies, owners=owners)
+        bodies = list(large.bodies)
+        for body in small.bodies:
+            rings = [b.group for b in large.bodies if b.encloses(body.center, image)]
+            group = rings[0] if rings else body.group + len(large.bodies)
+            bodies.append(replace(body, group=group))
+        self.bodies = replace(large, bodies=tuple(bodies), owners=owners)
 
     def add_companions(self, new, image, label):
         """Adds peaks beside others: positions and heights of an image's residual there."""
@@ -109,5 +113,7 @@ class Search:
             body = centers.get(tuple(self.positions[i]))
             if body is not None:
                 center_of[body] = k
-        groups = [center_of.get(self.owners[i], k) for k, i in enumerate(order)]
+        hosts = [body.group for body in self.bodies.bodies]
+        of = [hosts[owner] if owner >= 0 else -1 for owner in self.owners]
+        groups = [center_of.get(of[i], k) for k, i in enumerate(order)]
         return order, np.array(groups, int)

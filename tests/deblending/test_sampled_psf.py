@@ -102,7 +102,8 @@ def test_psfs_are_of_observations_on_the_frames_pixels(psf, grid, n):
 def test_stars_with_psfs_of_their_own_are_left_out_unless_they_keep_the_core(keeps_core):
     psf, place = pixel_psf(), np.array([20.3, 22.4])
     own = (PSF.gaussian(2.0),)
-    field = StarPSFs(psf, None, place[None], own, np.zeros((1, 1)), np.array([keeps_core]))
+    errors = np.zeros((1, 1)), np.full((1, 1), np.inf)
+    field = StarPSFs(psf, None, place[None], own, *errors, np.array([keeps_core]))
     home, one = Frame(GRID, model_psf(0.8)), with_psf_field(observation(), field)
     assert sampled_psfs(home, [one], place) == ((psf,) if keeps_core else ())
     assert sampled_psfs(home, [one], place + 5) == (psf,)

@@ -10,6 +10,7 @@ from clresample.measurement.clumps import bodies_of, small_bodies_of
 from clresample.measurement.columns import Columns
 from clresample.measurement.hills import saddles
 from clresample.measurement.photometry import group_fluxes, whole_groups
+from clresample.measurement.searched import Search
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -246,3 +247,20 @@ def test_a_knot_beside_a_galaxys_light_is_in_its_group_inside_its_radius():
     found = judged(image, [MIDDLE, *knots, away])
     assert len(found.bodies) == 1
     assert found.owners.tolist() == [0, 0, 0, -1]
+
+
+@pytest.mark.parametrize(
+    "part, radius, height, width, middle", [(0.4, 20, 200, 4, 1300), (0.6, 24, 40, 3, 500)]
+)
+def test_a_ring_and_its_middle_are_in_one_group(part, radius, height, width, middle):
+    """Brighter on two sides, which look like nuclei; or, of a faint one, beyond a dark gap."""
+    y, x = np.indices((SIZE, SIZE)) - 60
+    around = 1 + part * np.cos(2 * np.arctan2(y, x))
+    image = height * np.exp(-0.5 * ((np.hypot(y, x) - radius) / width) ** 2) * around
+    image += disk(4, middle)
+    found = Search(None, 5.0, [])
+    for place in (MIDDLE, MIDDLE - (0, radius), MIDDLE + (0, radius)):
+        found._put(place, float(image[tuple(place.astype(int))]), "E")
+    found.sort_out(image, FWHM, 0.1)
+    groups = found.in_order()[1]
+    assert len(groups) == 3 and len(set(groups.tolist())) == 1

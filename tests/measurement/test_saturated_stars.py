@@ -150,6 +150,18 @@ def test_light_behind_a_listed_source_is_that_of_the_opposite_side():
     assert (found[15:25, 40] == 9).all() and found.max() == 9
 
 
+def test_what_lasts_along_rays_is_no_noise_and_no_light_of_all_rays_but_a_mean_too_bright():
+    rng, known = np.random.default_rng(3), np.ones((80, 200), bool)
+    noise, spike = rng.normal(0, 1, known.shape), np.zeros(known.shape)
+    spike[:, 40] = 4.0
+    for level in (0.0, 0.2, -0.5):  # of wings of galaxies, and of a mean that falls too slowly
+        found = _lasting(noise + spike + level, known, ~known, np.zeros(80), 3, 3.0)[5:, :-1]
+        np.testing.assert_allclose(found[:, 40], 4 + level, atol=1.0)
+        others = np.delete(found, 40, axis=1)
+        np.testing.assert_allclose(others.mean(), min(level, 0), atol=0.05)
+        assert others.std() < 0.1
+
+
 def test_a_halo_is_a_power_of_the_distance_through_rings_that_rise_and_fall():
     y, x = np.indices((121, 121)) - 60
     away = np.hypot(y, x)

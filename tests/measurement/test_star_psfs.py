@@ -155,3 +155,26 @@ def test_a_neighbour_has_the_error_of_a_stars_light_of_one_sign_over_all_of_it(s
     ]
     wanted[owner[star]] = [0, 0]
     np.testing.assert_allclose(found, wanted)
+
+
+def test_neighbours_have_the_error_of_a_measured_stars_light_where_it_is_extrapolated():
+    """psf_error of it up to the last ring, beside that all of it from twice that ring's radius."""
+    light, used = np.full((1, 1, 24), 1e-3), np.ones((1, 1, 24), bool)
+    images = ComponentImages((2, 1, 1, 24), [(0, 0), (0, 0)], [light, light.copy()])
+    part = SimpleNamespace(spectrum=np.ones(1), morphology=np.ones((1, 1)))
+    result = SimpleNamespace(
+        components=[part, part],
+        rendered=[images],
+        channel_slices=lambda: [slice(0, 1)],
+        footprints=[SimpleNamespace(used=used)],
+        observations=[SimpleNamespace(weights=np.full(used.shape, 1e6))],
+        sources=range(2),
+        psf_error=0.1,
+    )
+    pixels, found = np.arange(24), []
+    for low, high in ((0, 5), (12, 24)):
+        model = np.where((pixels >= low) & (pixels < high), 1.0, 0.0)[None, None]
+        other = (slice(0, 1), slice(0, 24)), model, np.ones(1)
+        errors = _neighbour_errors(result, 0, 0, [1], lambda s, o=other: o, (0, 0), np.array([6.0]))
+        found.append(result.psf_error * errors[1, 0])
+    assert found == pytest.approx([1e-4, 1e-3])

@@ -13,6 +13,11 @@ from ..component_images import image_within, joint_window, window_of
 from ..inspection.star_psfs import StarPSFs
 from ..start.star_weights import MIN_PSF_ERROR_SIGMA
 
+# [1] Error of the power of the distance by which a saturated star's light is continued beyond the
+# last ring in which it was measured. Under PSFs with Moffat wings it is 0.9 to 1.7 of the truth at
+# 1.4 radii of that ring, and 0.9 to 2.3 at twice the radius.
+EXTRAPOLATED = 1.0
+
 
 def core_errors(result) -> np.ndarray:
     """Errors (S, C) [counts] of fluxes by the errors of stars' PSFs.
@@ -24,7 +29,8 @@ def core_errors(result) -> np.ndarray:
     """
     found = np.zeros((len(result.sources), len(result.channels)))
     owner = np.array([c.source for c in result.components], int)
-    if not any(isinstance(result.sources[s], PointSource) for s in owner):
+    is_star = any(isinstance(result.sources[s], PointSource) for s in owner)
+    if not is_star or not result.psf_error:
         return found
     for i, observation in enumerate(result.observations):
         field, channels = observation.psf_field, result.channel_slices()[i]
@@ -39,8 +45,8 @@ def core_errors(result) -> np.ndarray:
             others = np.unique(owner[owner != source])
             # wings that were measured do not follow from the width of a core
             is_measured = star is not None and not field.keeps_core[star]
-            place = None if is_measured else place
-            errors = _neighbour_errors(result, i, k, others, model, place)
+            measured_px = field.measured_px[star] if is_measured else None
+            errors = _neighbour_errors(result, i, k, others, model, place, measured_px)
             found[:, channels] = np.hypot(found[:, channels], errors)
     return result.psf_error * found
 
@@ -112,7 +118,7 @@ def _model(result, i, parts):
     return window, model, flux
 
 
-def _neighbour_errors(result, i, k, others, model_of, place):
+def _neighbour_errors(result, i, k, others, model_of, place, measured_px=None):
     """Flux errors (S, Co) [counts / psf_error] of other sources by light L of a star, component k.
 
         |sum_pixels w m (L, r . grad L)| / sum_pixels w m^2 flux
@@ -123,10 +129,16 @@ def _neighbour_errors(result, i, k, others, model_of, place):
 
     others (n,): numbers of the other sources; model_of: returns `_model` of one
     place (2,) [px]: of the star, from which r is; None leaves the width out
+    measured_px (Co,): radius up to which the star's light was measured, or None. It does not follow
+        from a width; beyond, it was extrapolated by a power of r that is known to EXTRAPOLATED
     """
     used, weights = result.footprints[i].used, result.observations[i].weights
     out = np.zeros((len(result.sources), len(weights)))
-    own, changes = _star_changes(result, i, k, place)
+    own, changes = _star_changes(result, i, k, place if measured_px is None else None)
+    if measured_px is not None:
+        away = np.hypot(*(np.mgrid[own] - np.reshape(place, (2, 1, 1))))
+        error = EXTRAPOLATED * (away / measured_px[:, None, None] - 1)
+        changes[0] *= np.clip(error, result.psf_error, 1) / result.psf_error
     beside = np.where(used[:, *own], weights[:, *own], 0.0)
     lowered = 1 + beside * result.psf_error**2 * sum(change**2 for change in changes)
     if not lowered.max(initial=1.0) > 1 + MIN_PSF_ERROR_SIGMA**2:

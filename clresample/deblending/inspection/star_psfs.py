@@ -24,6 +24,7 @@ from scipy.ndimage import (
     gaussian_filter,
     map_coordinates,
     median_filter,
+    uniform_filter1d,
 )
 
 from ...sky.observation import with_psf_field
@@ -42,6 +43,9 @@ MEDIANS_FWHM = {-np.inf: 8.0, 30.0: 3.0, 100.0: 1.0}
 # [sigma], [distance from the star] Light of a listed source ends where the median of a ring around
 # it is fainter, or at this part of the distance: beyond both it is taken for the star's.
 LIGHT_SIGMAS, REACH_PART = 0.25, 0.75
+# [its error] Smallest departure of a median along a ray from that of all rays: smaller ones are
+# noise and wings of galaxies. Those of listed sources are as faint as LIGHT_SIGMAS, one error.
+MIN_LASTING = 4.0
 # Iterations in which the smoothed remainder is added, so that gradients are preserved.
 N_ROUNDS = 5
 # [FWHM of the PSF] Radius of a core from which a source listed as a galaxy is fitted as a star: no
@@ -76,6 +80,7 @@ class StarPSFs(PSFField):
     psf: PSF at all other places, or field: PSFField of them; places (K, 2) [px] of the stars
     own (K): PSFs of the stars
     flux_error (K, C) [1]: relative flux error of each star, beyond that of the PSF's width
+    measured_px (K, C): radius beyond which the light of each star is extrapolated
     keeps_core (K,): bool, stars with the PSF passed and wings of their own beyond its image
     """
 
@@ -84,6 +89,7 @@ class StarPSFs(PSFField):
     places: np.ndarray
     own: tuple[PSF, ...]
     flux_error: np.ndarray
+    measured_px: np.ndarray
     keeps_core: np.ndarray
 
     @property
@@ -146,11 +152,13 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
     o, numbers = image.observation, sorted(found)
     psfs = tuple(_combine_psfs(_listed_psf(o, image.listed[i]), found[i]) for i in numbers)
     flux_error = np.zeros((len(numbers), len(grown)))
+    measured_px = np.full(flux_error.shape, np.inf)
     for k, i in enumerate(numbers):
         for c, measured in found[i].items():
-            flux_error[k, c] = measured.flux_error
+            flux_error[k, c], measured_px[k, c] = measured.flux_error, measured.measured_px
     keeps_core = n_own[numbers] == 0
-    field = StarPSFs(o.psf, o.psf_field, image.listed[numbers], psfs, flux_error, keeps_core)
+    places, own = image.listed[numbers], (flux_error, measured_px, keeps_core)
+    field = StarPSFs(o.psf, o.psf_field, places, psfs, *own)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_wide, n_own
 
 
@@ -201,12 +209,14 @@ def _combine_psfs(given, own):
 class MeasuredPSF:
     """A star's own PSF in a channel.
 
-    image (ny, nx): its samples, center (2,) [samples]; flux_error, keeps_core: see StarPSFs
+    image (ny, nx): its samples, center (2,) [samples]; flux_error, measured_px, keeps_core: see
+        StarPSFs
     """
 
     image: np.ndarray
     center: np.ndarray
     flux_error: float
+    measured_px: float
     keeps_core: bool
 
 
@@ -245,7 +255,8 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         scale = _amplitude(psf, c, data, image.usable[c] & free & (away < radius), middle)
     else:
         scale = _scale(psf, c, profile, radius)
-    rays, seen, free = _rays(data - profile.at(away), image.usable[c], free, middle, radius)
+    rest = (data - profile.at(away)) / image.sigma[c]
+    rays, seen, free = _rays(rest, image.usable[c], free, middle, radius)
     if not scale or not (seen & free).any():
         return None
     light = profile.at(np.arange(len(rays))) / image.sigma[c]
@@ -268,7 +279,7 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     away, turn = np.hypot(y[:, None], x), np.arctan2(y[:, None], x) / (2 * np.pi)
     n_angles = lasting.shape[1] - 1
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
-    more = _smooth(more, fwhm / SIGMAS_A_FWHM / step)
+    more = image.sigma[c] * _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
     if keeps_core:
         more *= 1 - taken
@@ -279,9 +290,10 @@ def _measure_psf(image, c, i, core, is_wide, sky):
     # the model's star lies at `place`, its light about the middle
     center = np.array([-y[0], -x[0]]) / step + (place - middle) / step
     if keeps_core:
-        return MeasuredPSF(whole / total, center, 0.0, keeps_core)
+        return MeasuredPSF(whole / total, center, 0.0, np.inf, keeps_core)
     own = profile.with_core(away, radius) + more
-    return MeasuredPSF(own / total, center, abs(profile.power(radius) - 2), keeps_core)
+    flux_error = abs(profile.power(radius) - 2)
+    return MeasuredPSF(own / total, center, flux_error, profile.end, keeps_core)
 
 
 def _measure_profile(data, usable, away, sigma, radius, keeps_core):
@@ -363,8 +375,12 @@ def _amplitude(psf, band, data, chosen, place):
 def _lasting(rest, known, hidden, light, first, fwhm):
     """Light above the mean that persists along rays: (radii, angles + 1), first angle repeated.
 
-    rest (radii, angles): light above the mean; known, hidden: its valid samples, and those of the
-        light of listed sources, bool
+    Where it departs from the median of all rays by less than MIN_LASTING errors it is that median,
+    or 0 if that is positive: the mean may be too bright where it is extrapolated, and wings of
+    galaxies are in all rays.
+
+    rest (radii, angles) [sigma]: light above the mean; known, hidden: its valid samples, and those
+        of the light of listed sources, bool
     light (radii,) [sigma]: the mean
     first: number of the core's last ring, within which the result falls to 0
     """
@@ -376,7 +392,13 @@ def _lasting(rest, known, hidden, light, first, fwhm):
     lasting = np.zeros_like(rest)
     for least, length in MEDIANS_FWHM.items():
         over = light > least
-        lasting[over] = median_filter(rest, (_odd(length * fwhm), 1), mode="nearest")[over]
+        size = _odd(length * fwhm)
+        median = median_filter(rest, (size, 1), mode="reflect")
+        n = size * uniform_filter1d((known | behind).astype(float), size, axis=0, mode="constant")
+        error = np.sqrt(np.pi / 2 / np.maximum(n, 1.0))
+        level = np.minimum(np.median(median, axis=1, keepdims=True), 0.0)
+        clear = np.abs(median - level) > MIN_LASTING * error
+        lasting[over] = np.where(clear, median, level)[over]
     lasting = lasting[tuple(nearest)]
     lasting[:first] = np.arange(first)[:, None] / max(first, 1) * lasting[first]
     return np.concatenate([lasting, lasting[:, :1]], axis=1)
