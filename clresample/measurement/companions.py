@@ -58,17 +58,18 @@ def symmetric_residual(image, seen, positions):
     from scipy.ndimage import map_coordinates
 
     light = np.where(seen, image, UNSEEN).astype(np.float32)
+    brightest = image[seen].max(initial=0)  # interpolated beside a hole, light is up to UNSEEN
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
     radii = np.arange(REACH_PX + 1.0)[:, None]
     total = np.zeros(image.shape, np.float32)
     for y, x in positions:
+        if not seen[round(y), round(x)]:  # its centre was not observed
+            continue
         rings = map_coordinates(
             light, [y + radii * np.sin(angles), x + radii * np.cos(angles)], order=1, cval=UNSEEN
         )
         rings = np.minimum(rings, np.roll(rings, N_ANGLES // 2, axis=1))
-        rings = np.clip(np.minimum.accumulate(rings, axis=0), 0, UNSEEN / 2)
-        if rings[0].max() == UNSEEN / 2:  # its centre was not observed
-            continue
+        rings = np.clip(np.minimum.accumulate(rings, axis=0), 0, brightest)
         bright = np.flatnonzero((rings > MIN_LIGHT).any(axis=1))
         if not len(bright):
             continue

@@ -134,3 +134,10 @@ def test_a_neighbour_is_seen_under_the_filter_of_small_galaxies_too(monkeypatch)
     for height, n in ((0.9 * MIN_WIDE, 0), (1.3 * MIN_WIDE, 1)):
         wide = host + spot((60, 72), height)
         assert len(beside(host + spot((60, 72), 90), wide, monkeypatch)) == n
+
+
+def test_a_centre_beside_unseen_pixels_has_at_most_the_light_that_was_seen():
+    image, seen = spot((60.3, 58.6), 500, sigma=6), SEEN.copy()
+    seen[61:, :60] = False
+    rest, model = rest_of(image, (60.3, 58.6), seen=seen)
+    assert model.max() <= image.max() and np.abs(rest[seen]).max() < 0.02 * 500

@@ -174,3 +174,27 @@ def test_sources_of_a_crowd_do_not_hide_one_another():
     places = np.array([source.position_px for source in found.sources])
     away = [np.hypot(*(places - [y0, x0]).T).min() for y0, x0, _ in bright + faint]
     assert max(away) < 2 and len(places) == 15
+
+
+@pytest.mark.parametrize("size", [0, 1.5, 4])
+@pytest.mark.parametrize("counts", [5, 50, 500, 2000])
+def test_a_source_whose_photons_are_noise_is_one(counts, size):
+    """In units of the sky's variance: the brighter a core is, the smaller are its weights."""
+    light = counts * gaussian(SHARP.shape, (38, 45), np.eye(2) * (1.5**2 + size**2))
+    noise = np.random.default_rng(8).normal(size=light.shape)
+    variance, psf = 1 + light, PSF.gaussian(1.5, n_pixels=31)
+    seen = Observation(light + noise * np.sqrt(variance), psf, SHARP, variance=variance)
+    (source,) = detect([seen]).sources
+    np.testing.assert_allclose(source.position_px, (38, 45), atol=2)
+
+
+def test_sources_in_the_shallow_part_of_a_mosaic_are_found():
+    """A sixteenth of the exposure has a sixteenth of the weight."""
+    places = [(y, x) for y in (20, 60) for x in (20, 45, 70)]
+    light = 100 * sum(gaussian(SHARP.shape, place, np.eye(2) * 4) for place in places)
+    variance = np.where(np.arange(SHARP.shape[1]) < 45, 1.0, 16.0) + 0 * light
+    noise = np.random.default_rng(9).normal(size=light.shape) * np.sqrt(variance)
+    seen = Observation(light + noise, PSF.gaussian(1.5, n_pixels=31), SHARP, variance=variance)
+    found = np.array([source.position_px for source in detect([seen]).sources])
+    assert len(found) == len(places)
+    assert all(np.hypot(*(found - place).T).min() < 1.5 for place in places)

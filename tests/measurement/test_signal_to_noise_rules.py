@@ -77,6 +77,16 @@ def test_where_nothing_was_seen_there_is_no_signal():
     assert alone.sums[0, 30, 30] == pytest.approx(one, rel=1e-4)
 
 
+@pytest.mark.parametrize("ratio, is_seen", [(9, True), (300, True), (1e4, True), (1e6, False)])
+def test_shallow_pixels_are_seen_and_those_of_almost_no_weight_are_not(ratio, is_seen):
+    """The part of the filter on pixels with weight counts, not the ratio of weights."""
+    weights = np.ones(GRID.shape)
+    weights[:, 30:] = 1 / ratio
+    o = Observation(np.zeros(GRID.shape), PSF.gaussian(1.5, n_pixels=31), GRID, weights=weights)
+    seen = signal_of(o, model_frame([o])).n_seen > 0
+    assert seen[:, :30].all() and (seen[:, 35:] == is_seen).all()
+
+
 def test_channels_are_those_of_the_narrowest_filter():
     rng = np.random.default_rng(6)
     psf = PSF.gaussian([1.0, 2.0], n_pixels=31)
