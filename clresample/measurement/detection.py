@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..deblending.inspection.filled import without_filled
+from ..deblending.inspection.noisy_variance import prepared
 from ..deblending.inspection.rays import without_rays
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.linear.spectra import MODEL_ERROR
@@ -112,7 +112,7 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     observations = as_observations(observations)
     check_observations(observations)
     frame = model_frame(observations) if frame is None else check_instance("frame", frame, Frame)
-    observations = without_rays(without_filled(observations)[0], frame)
+    observations = without_rays(prepared(observations)[0], frame)
     return _search(observations, frame, threshold, [], scatters)
 
 
@@ -123,7 +123,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
     observation: one; frame: Frame that it is searched in
     """
-    return signal_of(without_filled([observation])[0][0], frame).scatters()
+    return signal_of(prepared([observation])[0][0], frame).scatters()
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:

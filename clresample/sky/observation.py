@@ -183,9 +183,14 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
 def masked(observation, pixels) -> Observation:
     """The same observation with the pixels (C, Ny, Nx) bool masked: their weight is 0."""
+    return with_weights(observation, np.where(pixels, 0.0, observation.weights))
+
+
+def with_weights(observation, weights) -> Observation:
+    """The same observation with these weights (C, Ny, Nx) [counts^-2]."""
     made = copy.copy(observation)
-    made.__dict__.pop("whitened", None)  # cached for the unmasked observation
-    made._set(weights=np.where(pixels, 0.0, observation.weights))
+    made.__dict__.pop("whitened", None)  # cached for the other weights
+    made._set(weights=weights)
     return made
 
 

@@ -12,12 +12,13 @@ from ..blend import Blend
 from ..settings import AUTO, SMALL, FitSettings
 from . import listing, shifted, spoilt
 from .centroids import centroids
-from .filled import without_filled
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
+from .noisy_variance import prepared
 from .pixel_noise import noise_lines
 from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths
+from .tilt import tilt_lines
 
 # A sky level is reported as left in or over-subtracted above this many of its errors, and above
 # this fraction of a pixel's noise, which changes a flux measured on 100 pixels by its own error.
@@ -86,8 +87,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     free = not (auto or small) and bool(settings.fit_sky)
     fit_sky = False
     n_channels = np.zeros((3, len(near)), int)  # of wide cores, of own PSFs, of all
-    seen, filled_lines = without_filled(blend.observations)
-    for observation, shift, found_filled in zip(seen, shifts, filled_lines, strict=True):
+    seen, changes = prepared(blend.observations)
+    for observation, shift, changed in zip(seen, shifts, changes, strict=True):
         image = InspectedImage.of(observation, frame, positions[near], shift)
         sky = sky_level(image)
         image = image.over(sky.level)
@@ -107,9 +108,9 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         expected = sky if free else sky.expected(wrong, dark, part * image.sigma)
         levels.append((sky, expected))
         fit_sky = fit_sky or fitted
-        lines = found_filled + _unmeasured(image)
+        lines = changed + _unmeasured(image)
         if not unknown:
-            about = (
+            about = tilt_lines(image, sky) or (
                 _unsure_lines(image, sky)
                 if free
                 else _level_lines(image, sky, wrong | dark, expected, fitted)

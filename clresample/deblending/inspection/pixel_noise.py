@@ -16,6 +16,10 @@ MIN_BLOCK_SCATTER = 1.2
 # [1] The same for the scatter of pixels, over that of the weights, and its inverse: 0.92 to 1.08 in
 # these channels.
 MAX_RATIO = 1.25
+# Noise of parts of an image: the median of the N_NEAR nearest blocks, without pixels further than
+# UNEVEN_CLIP, and the ratio of its quantiles UNEVEN_PARTS that is reported, of at least MIN_UNEVEN
+# blocks. It is at most 1.15 in 36 clean simulated images, and 1.4 in stamps with a wide galaxy.
+N_NEAR, UNEVEN_CLIP, UNEVEN_PARTS, MIN_UNEVEN, MAX_UNEVEN = 9, 10.0, (0.1, 0.9), 40, 1.6
 # Smallest number of pixels: correlations then have errors of 0.02.
 MIN_PIXELS = 1000
 # [px] Distance at which noise of resampled images is no longer correlated.
@@ -41,7 +45,7 @@ def noise_lines(image, sky) -> list[str]:
         own = _scatter(local[c][pixels[c]])
         # that of the blocks' means is of smooth noise, or of light that is brighter than the noise
         scatter[c] = max(own, min(np.hypot(own, sky.block_scatter[c] / sky.blocks.side), 1))
-    lines = []
+    lines = _uneven_lines(local, pixels, sky.blocks, o.channels)
     correlated = (correlation > MIN_CORRELATION) & (sky.block_scatter > MIN_BLOCK_SCATTER)
     if o.noise is None and correlated.any():
         side, ratio = sky.blocks.side, np.median(sky.block_scatter[correlated])
@@ -60,6 +64,32 @@ def noise_lines(image, sky) -> list[str]:
             "the image"
         )
     return lines
+
+
+def _uneven_lines(local, pixels, blocks, channels):
+    """A message about noise that differs between parts of an image, in units of the weights'.
+
+    local (C, My, Mx): pixels less the mean of their block; pixels (C, My, Mx): bool, those used
+    """
+    counts = blocks.sums(pixels.astype(float))
+    squares = blocks.sums(np.where(pixels, np.minimum(local**2, UNEVEN_CLIP**2), 0.0))
+    ratio = np.ones(len(local))
+    for c in np.flatnonzero((counts > blocks.side**2 / 2).sum(axis=1) >= MIN_UNEVEN):
+        used = counts[c] > blocks.side**2 / 2
+        centers = blocks.centers()[used]
+        away = ((centers[:, None] - centers) ** 2).sum(axis=-1)
+        near = np.argsort(away, axis=1, kind="stable")[:, :N_NEAR]
+        scatter = np.sqrt(np.median((squares[c] / np.maximum(counts[c], 1))[used][near], axis=1))
+        low, high = np.quantile(scatter, UNEVEN_PARTS)
+        ratio[c] = high / max(low, 1e-3)
+    uneven = ratio > MAX_UNEVEN
+    if not uneven.any():
+        return []
+    return [
+        "the noise differs between parts of the image, unlike the weights: it scatters by "
+        f"{_parts(channels, ratio, uneven)} times as much in some parts as in others; errors are "
+        "wrong there, and noise may be taken for sources; give a variance map"
+    ]
 
 
 def _scatter(values):

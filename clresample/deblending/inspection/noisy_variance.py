@@ -1,0 +1,119 @@
+"""Smooths variances that follow the noise of the data they belong to."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...sky.observation import with_weights
+from .filled import without_filled
+from .image import SIGMAS_A_FWHM
+from .levels import SIGMAS_A_MAD
+
+# [1] Smallest correlation of the deviations of variance and data from their neighbours, and [sigma]
+# smallest bias of a pixel's flux by it, that are mended: the sum over 100 pixels is off by a third
+# of its error. Sky of 1000 counts has 0.03, variances without the data's noise less than 0.005.
+MIN_CORRELATION, MIN_BIAS = 0.3, 0.03
+MIN_PIXELS = 300  # correlations then have errors of 0.06
+CLIP = 4.0  # [sigma] Pixels that deviate more are sources or defects.
+# Part of a Gaussian within these sigmas, by which sigma is found: the median of counts may be 0.
+WITHIN, WITHIN_SIGMAS = 0.9, 1.645
+# Width of the Gaussian mean at sources, in that of the PSF (a point's peak keeps 0.6), and of that
+# elsewhere, whose noise in images of a few counts would make weights unequal; at least [px].
+NARROW, WIDE, MIN_WIDTH_PX = 0.7, 3.0, 0.7
+LIGHT_SIGMAS = 3.0  # of the narrow mean above the wide one, from which a source is there
+NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+
+
+def prepared(observations) -> tuple[tuple, list[list[str]]]:
+    """Observations as they are searched and fitted, and lines about what was changed in each.
+
+    Pixels without data are masked, by `without_filled`, and variances are `with_smooth_variances`.
+    """
+    observations, filled = without_filled(observations)
+    observations, smoothed = with_smooth_variances(observations)
+    return observations, [a + b for a, b in zip(filled, smoothed, strict=True)]
+
+
+def with_smooth_variances(observations) -> tuple[tuple, list[list[str]]]:
+    """The observations with variances that do not follow their noise, and lines about them.
+
+    A pixel that is low by its noise has too small a variance if that was made from its own counts,
+    and too large a weight: fluxes are too low by cov(data, variance) / variance a pixel. Where dark
+    pixels show that, variances are replaced by means over their neighbours.
+    Observations without such variances are returned as they are.
+    """
+    made, lines = [], []
+    for o in observations:
+        biases = [_bias(*pair) for pair in zip(o.data, o.weights, strict=True)]
+        wrong = np.flatnonzero(biases)
+        if len(wrong):
+            weights = o.weights.copy()
+            for c in wrong:
+                width = o.psf.fwhm_px[c] / SIGMAS_A_FWHM
+                weights[c] = _smooth(o.weights[c], max(NARROW * width, MIN_WIDTH_PX))
+            o = with_weights(o, weights)
+        made.append(o)
+        lines.append(_lines(o, biases) if len(wrong) else [])
+    return tuple(made), lines
+
+
+def _lines(o, biases):
+    some = ", ".join(f"{b:.2g} sigma ({n})" for b, n in zip(biases, o.channels, strict=True) if b)
+    return [
+        "the variance follows the noise of the data itself, as if made from its own counts: "
+        f"fluxes would be too low by {some} a pixel; its mean over neighbouring pixels is taken, "
+        "and errors are less certain; give a variance from a smoothed image or a model"
+    ]
+
+
+def _bias(data, weights):
+    """Bias of a pixel's flux by its variance [sigma], towards zero; 0 if not significant.
+
+    data, weights (My, Mx)
+    """
+    from scipy.ndimage import convolve
+
+    seen = weights > 0
+    if not seen.any() or np.ptp(weights[seen]) <= 1e-6 * weights.max():
+        return 0.0
+    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
+    inner = convolve(seen.astype(float), NEIGHBOURS, mode="constant") > 0.99
+    around = convolve(np.where(seen, data, 0.0), NEIGHBOURS, mode="constant")
+    beside = convolve(variance, NEIGHBOURS, mode="constant")
+    inner &= seen
+    if np.count_nonzero(inner) < 2 * MIN_PIXELS:
+        return 0.0
+    dark = inner & (around <= np.median(around[inner]))
+    d, v = (data - around)[dark], (variance - beside)[dark]
+    kept = np.abs(d) < CLIP * np.quantile(np.abs(d), WITHIN) / WITHIN_SIGMAS
+    if np.count_nonzero(kept) < MIN_PIXELS or not v[kept].any():
+        return 0.0
+    (own, both), (_, other) = np.cov(d[kept], v[kept])
+    bias = both / (1 + 1 / 4) / np.median(beside[dark]) ** 1.5
+    correlated = both > MIN_CORRELATION * np.sqrt(own * other)
+    return float(bias) if correlated and bias > MIN_BIAS else 0.0
+
+
+def _smooth(weights, width):
+    """Weights (My, Mx) of variances averaged over neighbours with a Gaussian `width` [px]."""
+    seen = weights > 0
+    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
+    narrow, wide = (_around(variance, seen, w) for w in (width, WIDE * width / NARROW))
+    excess = narrow - wide
+    sigma = SIGMAS_A_MAD * np.median(np.abs(excess[seen]))
+    variance = np.where(excess > LIGHT_SIGMAS * sigma, narrow, wide)
+    return np.divide(1, variance, out=np.zeros(weights.shape), where=seen & (variance > 0))
+
+
+def _around(values, seen, width):
+    """Gaussian means of the other pixels `seen` about each, which do not know its own noise."""
+    from scipy.ndimage import gaussian_filter
+
+    one = np.zeros((2 * int(4 * width + 1) + 1,) * 2)
+    one[tuple(n // 2 for n in one.shape)] = 1
+    own = gaussian_filter(one, width).max()
+    total, share = (
+        gaussian_filter(v, width, mode="constant") - own * v
+        for v in (np.where(seen, values, 0.0), seen.astype(float))
+    )
+    return np.divide(total, share, out=values.copy(), where=share > 1e-3)

@@ -1,0 +1,77 @@
+"""Variances that follow the data, skies that vary and noise that differs are named before a fit."""
+
+import numpy as np
+import pytest
+from helpers.inspection import DRAWN, NOISE, image_of, inspected, observed, sources_of
+
+from clresample.deblending.inspection import noisy_variance
+
+WIDE = (128, 120)
+GALAXY = (((64.3, 60.1), (3000, 5000), 8.0),)
+
+
+def counts_of(sky, seed=0, shape=WIDE):
+    """Expected counts (2, Ny, Nx), sky included, and a draw of them."""
+    expected = image_of(GALAXY, noise=0, shape=shape) + sky
+    return expected, np.random.default_rng(seed).poisson(expected).astype(float)
+
+
+@pytest.mark.parametrize("sky", [2, 10, 50])
+def test_a_variance_of_the_datas_own_counts_is_smoothed_and_fluxes_are_right(sky):
+    expected, counts = counts_of(sky)
+    given = observed(counts - sky, weights=None, variance=np.maximum(counts, 1))
+    (made,), (lines,) = noisy_variance.with_smooth_variances([given])
+    assert len(lines) == 1 and "own counts" in lines[0] and "(g)" in lines[0] and "(r)" in lines[0]
+    light = expected - sky
+    for weights, low in ((given.weights, True), (made.weights, False)):
+        error = (weights * light**2).sum(axis=(1, 2)) ** -0.5
+        flux = (weights * light * given.data).sum(axis=(1, 2)) * error**2
+        assert (flux < 1 - 1.5 * error).all() if low else (np.abs(flux - 1) < 3 * error).all()
+    exact = ((light**2 / expected).sum(axis=(1, 2))) ** -0.5
+    assert error == pytest.approx(exact, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["of the model", "of the sky", "of a faint read noise"])
+def test_other_variances_are_left(kind, seed):
+    expected, counts = counts_of(50, seed)
+    # own counts over a sky of many
+    variance = {"of the model": expected, "of the sky": np.full(WIDE, 50.0)}.get(kind)
+    variance = counts + 5000 if variance is None else variance
+    given = observed(counts - 50, weights=None, variance=variance)
+    made, lines = noisy_variance.with_smooth_variances([given])
+    assert made[0] is given and lines == [[]]
+
+
+def varied(image, **given):
+    return inspected([observed(image, **given)]).messages
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("side, axis", [("larger x", 1), ("smaller y", 0)])
+@pytest.mark.parametrize("step", [False, True])
+def test_a_sky_that_rises_is_named_by_its_side(step, side, axis, seed):
+    along = np.indices(WIDE)[axis] / WIDE[axis] - 0.5
+    along = (np.sign(along) / 2 if step else along) * (1 if "larger" in side else -1)
+    (message,) = varied(image_of(seed=seed, shape=WIDE) + 0.5 * NOISE * along)
+    assert "sky level varies" in message and f"towards {side};" in message
+
+
+@pytest.mark.parametrize("size", [4.0, 12.0, 30.0])
+@pytest.mark.parametrize("place", [(20.0, 20.0), (64.0, 110.0)])
+def test_wings_of_a_wide_galaxy_are_no_varying_sky(place, size):
+    drawn = (*DRAWN, (place, (2e4, 3e4), size))
+    found = inspected([observed(image_of(drawn, shape=WIDE))], sources_of(drawn)).messages
+    assert not any("varies" in line for line in found)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 3.0])
+def test_noise_that_differs_between_parts_is_named(factor):
+    image = image_of(shape=WIDE)
+    noise = np.random.default_rng(5).normal(0, NOISE, image.shape)
+    image[..., 60:] += np.sqrt(factor**2 - 1) * noise[..., 60:]
+    variance = np.full(image.shape, NOISE**2)
+    variance[..., 60:] *= factor**2
+    named = ["noise differs between parts" in line for line in varied(image)]
+    assert any(named) == (factor > 1)
+    assert varied(image, weights=None, variance=variance) == []
