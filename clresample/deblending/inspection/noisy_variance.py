@@ -10,9 +10,9 @@ from .image import SIGMAS_A_FWHM
 from .levels import SIGMAS_A_MAD
 
 # [1] Smallest correlation of the deviations of variance and data from their neighbours, and [sigma]
-# smallest bias of a pixel's flux by it, that are mended: the sum over 100 pixels is off by a third
-# of its error. Sky of 1000 counts has 0.03, variances without the data's noise less than 0.005.
-MIN_CORRELATION, MIN_BIAS = 0.3, 0.03
+# smallest bias of a pixel's flux by it, that are mended: the sum over 100 pixels is off by half of
+# its error. Sky of 400 counts has 0.05, variances without the data's noise less than 0.005.
+MIN_CORRELATION, MIN_BIAS = 0.3, 0.05
 MIN_PIXELS = 300  # correlations then have errors of 0.06
 CLIP = 4.0  # [sigma] Pixels that deviate more are sources or defects.
 # Part of a Gaussian within these sigmas, by which sigma is found: the median of counts may be 0.

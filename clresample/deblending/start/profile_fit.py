@@ -80,15 +80,15 @@ class ProfileFit:
 
     def run(self):
         """Steps to the end, from two starts if galaxies are large; sets faint ones from grids."""
-        some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
-        self._step(np.flatnonzero(some), learn=True, until_grown=True)
+        some = np.unique(self.looking.scene[self.counts > 0])
+        self._step(some, learn=True, until_grown=True)
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
-        run_from_equal_profiles(self, np.flatnonzero(some))
-        fit_faint_shapes(self, np.flatnonzero(some))
+        run_from_equal_profiles(self, some)
+        fit_faint_shapes(self, some)
 
     def _copy(self):
         """Copies of chi2, theta, the solution and the prior."""
@@ -168,10 +168,8 @@ class ProfileFit:
                 break
             gain = self._try(scenes, trial[on])
             gained = gain > 0
-            last = _is_last(gain, promised[on], tol)
-            live[scenes] = steps.take(scenes, gain, promised[on]) & ~last
-            if until_grown:
-                live &= ~_have_grown(self)
+            going = steps.take(scenes, gain, promised[on]) & ~_is_last(gain, promised[on], tol)
+            live[scenes] = going & ~(until_grown & _have_grown(self)[scenes])
             if gained.any():
                 self._take_equations(scenes[gained])
             some = scenes[gained & live[scenes] & learning[scenes]]
@@ -252,9 +250,8 @@ class ProfileFit:
 
     def _measure_brightness(self, theta):
         """Stores the components' peaks over a model pixel's noise, in their best channel."""
-        looking = self.looking
-        best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
-        self.brightness = best * peaks_of(looking.components, self.thetas(theta))
+        best = (self.looking.spectra / self.noise[self.looking.scene]).max(axis=1)
+        self.brightness = best * peaks_of(self.looking.components, self.thetas(theta))
 
 
 def _is_last(gain, promised, tol):
