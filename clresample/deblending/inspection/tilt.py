@@ -19,7 +19,7 @@ WIDTHS = 2.0, 4.0, 8.0, 16.0
 # distance from an edge. No step or plane is found in 44 clean simulated images, also of crowds on
 # one side, bright stars and galaxies of 20 to 60 px; 12 of 12 planes of 0.5 sigma are.
 STEP_PART, MARGIN = 2.0, 4
-N_ROUNDS = 4
+N_ROUNDS = 2
 
 
 def tilt_lines(image, sky) -> list[str]:
