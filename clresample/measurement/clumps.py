@@ -107,15 +107,15 @@ class Body:
         y, x = np.rint(position).astype(int) - [rows.start, columns.start]
         return bool(0 <= y < mask.shape[0] and 0 <= x < mask.shape[1] and mask[y, x])
 
-    def encloses(self, position, image):
-        """Returns True if a peak at (2,) [px] of an image is of its group, in its light or a hole.
-
-        A ring's middle has a body of its own, beyond a dark gap.
-        """
+    def without_holes(self) -> Body:
+        """With an outline around its holes: a ring's middle is a body of its own, beyond a gap."""
         where, mask = self.outline
+        return replace(self, outline=(where, ndimage.binary_fill_holes(mask)))
+
+    def encloses(self, position, image):
+        """Returns True if a peak at (2,) [px] of an image is of its group."""
         above = float(image[tuple(np.rint(position).astype(int))]) - self.level
-        filled = replace(self, outline=(where, ndimage.binary_fill_holes(mask)))
-        return filled.contains(position) and self.takes(above, self.level)[1]
+        return self.contains(position) and self.takes(above, self.level)[1]
 
     def takes(self, above, base):
         """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.

@@ -82,9 +82,9 @@ class Search:
         small = small_bodies_of(image, np.array(self.positions)[free], *given)
         owners = large.owners.copy()
         owners[free] = np.where(small.owners < 0, -1, small.owners + len(large.bodies))
-        bodies = list(large.bodies)
+        bodies, whole = list(large.bodies), [body.without_holes() for body in large.bodies]
         for body in small.bodies:
-            rings = [b.group for b in large.bodies if b.encloses(body.center, image)]
+            rings = [b.group for b in whole if b.encloses(body.center, image)]
             group = rings[0] if rings else body.group + len(large.bodies)
             bodies.append(replace(body, group=group))
         self.bodies = replace(large, bodies=tuple(bodies), owners=owners)
