@@ -181,15 +181,18 @@ def _darker(image, centers, wings):
     Infinite of those in a source.
     """
     light = (wings / image.sigma[:, None]).sum(axis=0) if len(wings) else np.zeros(len(centers))
-    free = np.ones(len(centers), bool)
-    places = image.places[np.isfinite(image.places).all(axis=1)]
-    if len(places):
-        squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
-        free = squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
+    free = away_from_sources(image, centers, NEAR_SOURCE)
     rank = np.full(len(centers), np.inf)
     order = np.argsort(light[free], kind="stable")
     rank[np.flatnonzero(free)[order]] = np.arange(len(order)) / max(len(order), 1)
     return rank
+
+
+def away_from_sources(image, centers, least):
+    """Selects centres (B,) of blocks further than `least` [FWHM] from all sources of an image."""
+    places = image.places[np.isfinite(image.places).all(axis=1)]
+    squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
+    return (squares > (least * image.width_px) ** 2).all(axis=1)
 
 
 def _wings(image, means, centers):

@@ -107,11 +107,10 @@ def _smooth(weights, width):
 
 def _around(values, seen, width):
     """Gaussian means of the other pixels `seen` about each, which do not know its own noise."""
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-    one = np.zeros((2 * int(4 * width + 1) + 1,) * 2)
-    one[tuple(n // 2 for n in one.shape)] = 1
-    own = gaussian_filter(one, width).max()
+    n = int(4 * width + 1)
+    own = gaussian_filter1d(np.eye(1, 2 * n + 1, n)[0], width)[n] ** 2
     total, share = (
         gaussian_filter(v, width, mode="constant") - own * v
         for v in (np.where(seen, values, 0.0), seen.astype(float))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .levels import CLIP, MIN_BLOCKS, POWERS, SIGMAS_A_MAD
+from .levels import CLIP, MIN_BLOCKS, POWERS, SIGMAS_A_MAD, away_from_sources
 
 # [sigma of a pixel] Smallest rise from edge to edge that is named: it changes a flux measured on
 # 100 pixels by more than its error. [1] Smallest decrease of the blocks' chi2 by a plane.
@@ -27,12 +27,19 @@ def tilt_lines(image, sky) -> list[str]:
 
     image: InspectedImage; sky: its SkyLevel, whose blocks are used
     """
-    names, usable = image.observation.channels, image.usable
+    names, usable, blocks = image.observation.channels, image.usable, sky.blocks
     data = np.where(usable, image.observation.data / image.sigma[:, None, None], 0.0)
-    rises = np.array([_rise(image, sky.blocks, *pair) for pair in zip(data, usable, strict=True)])
-    if len(data) > 1:  # all together tell a smaller one
-        seen, root = usable.all(axis=0), len(data) ** 0.5
-        common = _rise(image, sky.blocks, np.where(seen, data.sum(axis=0) / root, 0.0), seen) / root
+    several, root = len(data) > 1, len(data) ** 0.5
+    if several:  # all together tell a smaller one
+        seen = usable.all(axis=0, keepdims=True)
+        data = np.concatenate([data, np.where(seen, data.sum(axis=0) / root, 0.0)])
+        usable = np.concatenate([usable, seen])
+    centers, counts = blocks.centers(), blocks.sums(usable.astype(float))
+    free = away_from_sources(image, centers, NEAR_SOURCE) & (2 * counts > blocks.side**2)
+    channels = zip(data, blocks.sums(data), counts, free, strict=True)
+    rises = np.array([_rise(image, centers, *own) for own in channels])
+    if several:
+        common, rises = rises[-1] / root, rises[:-1]
         rises = np.where(rises.any(axis=1, keepdims=True), rises, common)
     size = np.abs(rises).sum(axis=1)
     if size.max() < MIN_RISE:
@@ -51,22 +58,19 @@ def tilt_lines(image, sky) -> list[str]:
     ]
 
 
-def _rise(image, blocks, data, usable):
-    """Rises (2,) of data (My, Mx) [sigma] from edge to edge along y and x; 0 if not significant."""
+def _rise(image, centers, data, sums, counts, free):
+    """Rises (2,) of data (My, Mx) [sigma] from edge to edge along y and x; 0 if not significant.
+
+    sums, counts (B,): of the data and of usable pixels in blocks; free (B,): bool, those used
+    """
     from scipy.optimize import nnls
 
-    none, centers = np.zeros(2), blocks.centers()
-    counts = blocks.sums(usable[None].astype(float))[0]
-    free = 2 * counts > blocks.side**2
-    places = image.places[np.isfinite(image.places).all(axis=1)]
-    if len(places) and len(centers):
-        squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
-        free &= squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
+    none = np.zeros(2)
     if np.count_nonzero(free) < 3 * MIN_BLOCKS:
         return none
     centers, counts = centers[free], counts[free]
-    z = blocks.sums(data[None])[0, free] / np.sqrt(counts)  # means in units of their noise
-    shape = np.array(usable.shape)
+    z = sums[free] / np.sqrt(counts)  # means in units of their noise
+    shape = np.array(data.shape)
     plane = np.column_stack([np.ones(len(z)), centers / shape - 0.5]) * np.sqrt(counts)[:, None]
     kept = np.ones(len(z), bool)
     for _ in range(N_ROUNDS):
