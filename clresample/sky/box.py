@@ -42,8 +42,8 @@ class Box(NamedTuple):
         return Box(self.y0 - n, self.x0 - n, self.y1 + n, self.x1 + n)
 
     def intersection(self, other) -> Box:
-        """Common part of two boxes; of area 0 where they do not overlap."""
-        y0, x0 = max(self.y0, other.y0), max(self.x0, other.x0)
+        """Common part of two boxes; of area 0, at the edge of this one, if they do not overlap."""
+        y0, x0 = (min(max(self[i], other[i]), self[i + 2]) for i in (0, 1))
         return Box(y0, x0, max(min(self.y1, other.y1), y0), max(min(self.x1, other.x1), x0))
 
     def union(self, other) -> Box:

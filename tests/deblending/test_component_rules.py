@@ -6,13 +6,23 @@ import numpy as np
 import pytest
 from helpers.told import named
 
-from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.component_images import ComponentImages, image_within, window_of
 from clresample.deblending.ended import Ended
 from clresample.deblending.linear.rendered_models import RenderedModel, model_of
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
 from clresample.sky.sources import ExtendedSource, PointSource
+
+
+@pytest.mark.parametrize("low", [(14, 3), (-9, 3), (2, 20), (2, -9), (40, 40)])
+def test_images_beyond_the_observation_have_an_empty_window(low):
+    """Whichever edge they lie beyond."""
+    rendered = ComponentImages.cropped((1, 2, 10, 12), [low], [np.ones((2, 4, 5))])
+    window = window_of(rendered, 0)
+    image = image_within(rendered, 0, window)
+    assert image.size == 0 and image.shape == np.zeros((2, 10, 12))[:, *window].shape
+    assert not np.asarray(rendered).any()
 
 
 def test_clear_gradients_have_odds_of_150_to_1():

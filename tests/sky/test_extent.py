@@ -91,6 +91,8 @@ def test_shared_part_of_two_boxes():
         here, there = intersect_boxes((0, 0), a.shape, origin, b.shape)
         assert a[here].size == b[there].size == 0
         assert a[here].shape == b[there].shape
+        # at an edge of the first array, not beyond it
+        assert all(0 <= s.start <= s.stop <= n for s, n in zip(here, a.shape, strict=True))
     assert box_slices(np.array([1, 2]), (3, 4)) == (slice(1, 4), slice(2, 6))
 
 
