@@ -16,6 +16,7 @@ import functools
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import gammaln, kve
 
 from ..sky.box import box_slices
 from ..sky.psf import PSF
@@ -39,6 +40,8 @@ ELLIPTICITY_SCATTER = 0.17
 WINGS, WINGS_SCATTER = 6.5, 0.7
 # Several components of a source start this far apart in ln(size), as a bulge and a disk do.
 COMPONENT_SPREAD = 1.0
+# From here on profiles have the waves of a Gaussian.
+ROUNDED_BETA = 50.0
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 # Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
@@ -75,6 +78,19 @@ def galaxy_reach(parameters, psf_moment, threshold):
     # beyond 1e12 the wings fill any frame
     q = 2 * beta * np.minimum(np.expm1(-np.log(threshold) / (beta + 1)), 1e12)
     return np.sqrt(q[:, None] * np.diagonal(c, axis1=1, axis2=2))
+
+
+def wave_light(parameters, psf_moment, nu):
+    """Largest transform (n,) of profiles of unit integral at frequencies nu (n,) [1/px].
+
+    parameters (n, 4); psf_moment (n, 2, 2)
+    That of (1 + q / (2 beta))^-(beta + 1), q = x^T C^-1 x, is z^beta K_beta(z) over its value at
+    z = 0, with z = 2 pi sqrt(2 beta nu^T C nu). It is largest along C's smallest axis.
+    """
+    beta = np.minimum(np.exp(parameters[:, 3]), ROUNDED_BETA)
+    least = np.linalg.eigvalsh(covariance(parameters, psf_moment)[0])[:, 0]
+    z = 2 * np.pi * nu * np.sqrt(2 * beta * least)
+    return np.exp(beta * np.log(z / 2) + np.log(2 * kve(beta, z)) - z - gammaln(beta))
 
 
 def profile(parameters, position, shape, psf_moment, *, slopes=True, moved=False):

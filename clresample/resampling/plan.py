@@ -111,28 +111,31 @@ class ResamplingPlan:
         lines = 0 if self.lines is None else self.lines.n_bytes
         return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
-    def window(self, shape, reach_px, precision: Precision, size=None) -> ResamplingPlan:
+    def window(self, shape, reach_px, precision: Precision, size=None, pixel=1) -> ResamplingPlan:
         """The plan of a box of the model and the part of the observation that its light reaches.
 
         One plan serves all boxes of a shape: its observed pixels are centred on the box, and their
         true offset is a shift of up to half an observed pixel. Not available for distorted
         mappings, which differ from place to place.
 
-        shape (2,) [model px]: of the box; reach_px [model px]: distance to which its light is
+        shape (2,) [box px]: of the box; reach_px [model px]: distance to which its light is
             rendered
         size (2,) [observed px]: of the window, at least as many; see PaddedMapping.for_box
+        pixel [model px]: side of the box's pixels, which are the plan's model pixels
         """
-        key = tuple(shape), reach_px, precision, size
+        key = tuple(shape), reach_px, precision, size, pixel
         if key not in self.windows:
-            mapping = PaddedMapping.for_box(self.mapping, shape, reach_px, size)
-            moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
+            own, reach = self.mapping.on_pixels(pixel), reach_px / pixel
+            mapping = PaddedMapping.for_box(own, shape, reach, size)
+            moved = np.abs(own.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
-            radius = np.minimum(self.certificate.wrap_radius_px, WRAP_MARGIN * reach_px)
+            known = np.array(self.certificate.wrap_radius_px) / pixel
+            radius = np.minimum(known, WRAP_MARGIN * reach)
             # distances in observed pixels up to which light is within the radius
-            seen = np.abs(np.linalg.inv(self.mapping.matrix)) @ radius
+            seen = np.abs(np.linalg.inv(own.matrix)) @ radius
             self.windows[key] = make_resampling_plan(
                 mapping,
-                self.psfs[0],
+                self.psfs[0].on_pixels(pixel),
                 cut_psf(self.psfs[1], seen),
                 precision=precision,
                 extent=extent,

@@ -69,6 +69,19 @@ class Mapping:
             inside &= (x >= low) & (x <= top)
         return inside
 
+    def on_pixels(self, pixel):
+        """This mapping to a model with pixels of a side `pixel` [px], not for distorted ones.
+
+        The model has the same corner. Its last pixels may end beyond the present ones.
+        """
+        return replace(
+            self,
+            shape_in=tuple(-(-n // pixel) for n in self.shape_in),
+            matrix=self.matrix / pixel,
+            offset=on_wide_pixels(self.offset, pixel),
+            departure_px=self.departure_px / pixel,
+        )
+
     def window(self, in_origin, in_shape, out_origin, out_shape, *, tolerance_px=None):
         """Mapping between a cutout of the observed pixels and a cutout of the model.
 
@@ -171,6 +184,11 @@ class PaddedMapping(Mapping):
             y0, x0, y1, x1 = self.part
             inside[:y0] = inside[y1:] = inside[:, :x0] = inside[:, x1:] = False
         return inside
+
+
+def on_wide_pixels(position, pixel):
+    """Positions [px] from a corner's pixel on, in pixels of a side `pixel` [px] from there on."""
+    return (position + 0.5) / pixel - 0.5
 
 
 def lattice(low, shape):

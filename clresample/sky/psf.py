@@ -113,6 +113,12 @@ class PSF(ReadOnly, PSFDisplay):
         psf._set(images, float(spacing), center)
         return psf
 
+    def on_pixels(self, pixel) -> PSF:
+        """The same PSF for a grid with pixels of a side `pixel` [px]."""
+        if pixel == 1:
+            return self
+        return PSF.restore(self.images, spacing=self.spacing / pixel, center=self.center)
+
     @property
     def n_bands(self) -> int:
         """C."""

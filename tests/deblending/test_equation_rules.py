@@ -24,7 +24,7 @@ SEEN = [2, 0]  # the scenes that are looked at
 class Sums:
     """A Sight whose pixels are one row, in NumPy: of random images, roots and data."""
 
-    ties, aim = None, SimpleNamespace(is_exact=True)
+    ties, aim = None, SimpleNamespace(is_exact=True, allow_wide_pixels=lambda: np.zeros(N_SCENES))
 
     def __init__(self, channels, seed):
         rng = np.random.default_rng(seed)
@@ -94,7 +94,7 @@ class Listed(SimpleNamespace):
 def posed(monkeypatch):
     """Makes a LinearisedScenes at Sums of scenes."""
 
-    def slots(chosen, thetas, boxes, *, slopes, levels):
+    def slots(chosen, thetas, boxes, pixels, *, slopes, levels):
         order = np.random.default_rng(3).permutation(len(chosen))
         numbers = [c.number for c in chosen]
         counts = (1 + slopes * np.array([PARTS[i][2] for i in numbers]))[order]
@@ -106,6 +106,7 @@ def posed(monkeypatch):
     def made(fit_sky, scenes=SEEN, slopes=True):
         monkeypatch.setattr(module, "ComponentBatch", slots)
         monkeypatch.setattr(module, "boxes_of", lambda chosen, thetas, t: t)
+        monkeypatch.setattr(module, "pixels_of", lambda *_: 1)
         components = [
             SimpleNamespace(scene=b, index=i, number=k) for k, (b, i, *_) in enumerate(PARTS)
         ]

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..profiles import GalaxyProfile, covariance, galaxy_reach
+from ...sky.mapping import on_wide_pixels
+from ..profiles import GalaxyProfile, covariance, galaxy_reach, wave_light
 
 # [px] Sides of boxes. There are few sizes, since each needs an operator, and components in boxes of
 # one size are rendered together. With more sizes, scenes with different pixel grids take a quarter
@@ -20,6 +21,9 @@ EDGE_NOISE_FRACTION = 0.01
 # Smallest and largest fraction of a profile's peak at the edge of its box: the first is the
 # precision of float32, the second is used before the flux is known.
 FAINTEST, BRIGHTEST = 1e-6, 2e-3
+# [px] Sides of pixels on which profiles are drawn in boxes beyond the last of BOX_SIDES, the widest
+# beyond which no wave has more than a part UNRESOLVED of the light.
+WIDE_PX, UNRESOLVED = (2, 4), 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +67,20 @@ def boxes_of(components, thetas, thresholds):
         c = components[i]
         middle[i], half[i] = c.shape.bounding_box(thetas[i], c.position, thresholds[i])
     return _boxes_about(middle, half, np.array([c.frame for c in components]).reshape(-1, 2))
+
+
+def pixels_of(components, thetas, boxes, wide):
+    """Sides (n,) [px] of the pixels on which components are drawn in boxes (n, 2, 2), powers of 2.
+
+    wide (n,): bool, those that may be drawn on wide pixels
+    """
+    pixels = np.ones(len(components), int)
+    large = wide & _galaxies(components) & (boxes[:, 1].max(axis=1) > BOX_SIDES[-1])
+    if large.any():
+        given = _stacked(components, thetas, large)
+        wider = np.array([wave_light(*given, 0.5 / pixel) <= UNRESOLVED for pixel in WIDE_PX])
+        pixels[large] *= 2 ** wider.sum(axis=0)
+    return pixels
 
 
 def peaks_of(components, thetas):
@@ -113,19 +131,24 @@ def profile_thresholds(brightness):
 class ComponentBatch:
     """Components drawn side by side; those of equal boxes and scenes follow each other.
 
-    components (n): any; thetas (n): their parameters; boxes (n, 2, 2): origins and sizes
+    components (n): any; thetas (n): their parameters; boxes (n, 2, 2) [px]: origins and sizes
+    pixels [px]: sides of their pixels, one or (n,)
     slopes: True to draw slopes with the profiles, or bool (n,) for each
     levels (..., n): by which they are ordered, see RenderPlanner.levels
 
-    order (n,): the components in the order of the slots; scene, n_images (n,), origin, size (n, 2),
+    order (n,): the components in the order of the slots; scene, n_images, pixel (n,), origin (n, 2)
+    size (n, 2): of the boxes in their pixels, of which the last may end beyond them
     begin (n,): first element of each slot's images in the device array that `draw` returns
     """
 
-    def __init__(self, components, thetas, boxes, *, slopes, levels=()):
+    def __init__(self, components, thetas, boxes, pixels=1, *, slopes, levels=()):
         scene = np.array([c.scene for c in components])
         origin, size = np.reshape(boxes, (-1, 2, 2)).swapaxes(0, 1)
+        pixels = np.broadcast_to(pixels, len(components))
+        size = -(-size // pixels[:, None])
         count = 1 + slopes * np.array([len(theta) for theta in thetas])
-        self.order = order = np.lexsort((scene, *levels, count, size[:, 1], size[:, 0]))
+        self.order = order = np.lexsort((scene, *levels, pixels, count, size[:, 1], size[:, 0]))
+        self.pixel = pixels[order]
         self.components = [components[i] for i in order]
         self.thetas = [thetas[i] for i in order]
         self.scene, self.n_images = scene[order], count[order]
@@ -138,7 +161,7 @@ class ComponentBatch:
 
     def runs(self, key):
         """First and last + 1 of slots that follow each other, equal in box, n_images, key (n,)."""
-        rows = np.column_stack([self.size, self.n_images, key])
+        rows = np.column_stack([self.size, self.n_images, self.pixel, key])
         cuts = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
         return list(zip([0, *cuts.tolist()], [*cuts.tolist(), len(rows)], strict=True))
 
@@ -183,7 +206,10 @@ class ComponentBatch:
         """Queues the kernel that draws the slots `at`."""
         table = np.column_stack([self.size, self.n_images, self.begin])[at].astype(np.int32)
         theta, moment = _stacked(self.components, self.thetas, at)
+        pixel = self.pixel[at, None]
+        theta[:, :1] -= np.log(pixel)
         place = np.array([c.position for c in self.components])[at] - self.origin[at]
+        place = on_wide_pixels(place, pixel)
         tallest, widest = self.size[at].max(axis=0).tolist()
         launch = device.launcher(
             "draw.cl",
@@ -196,7 +222,7 @@ class ComponentBatch:
         launch(
             (1 if tuning.row_loops else widest, tallest, len(table)),
             table=device.put(table),
-            shape=device.put(_shapes(theta, place, moment), dtype),
+            shape=device.put(_shapes(theta, place, moment / pixel[..., None] ** 2), dtype),
             images=images,
         )
 

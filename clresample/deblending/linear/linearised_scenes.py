@@ -12,6 +12,7 @@ from .component_batch import (
     ComponentBatch,
     boxes_of,
     peaks_of,
+    pixels_of,
     profile_thresholds,
     renumbered,
 )
@@ -65,6 +66,7 @@ class LinearisedScenes:
         self.sky = np.zeros((n_scenes, self.n_channels))
         known = np.concatenate([sight.sky_precision for sight in sights], axis=1)
         self.sky_precision = known * bool(fit_sky)
+        self._allow_wide_pixels = np.all([s.aim.allow_wide_pixels() for s in sights], axis=0)
         self._kept: dict = {}
 
     def render(self, scenes, thetas, brightness, *, slopes, whiten=True):
@@ -77,9 +79,10 @@ class LinearisedScenes:
         at = np.flatnonzero(np.isin(self.scene, self.scenes))
         chosen, theta = [self.components[i] for i in at], [thetas[i] for i in at]
         boxes = boxes_of(chosen, theta, profile_thresholds(brightness[at]))
+        pixels = pixels_of(chosen, theta, boxes, self._allow_wide_pixels[self.scene[at]])
         slopes = np.broadcast_to(slopes, len(self.components))[at]
         levels = self._levels(chosen, theta, brightness[at])
-        self.slots = ComponentBatch(chosen, theta, boxes, slopes=slopes, levels=levels)
+        self.slots = ComponentBatch(chosen, theta, boxes, pixels, slopes=slopes, levels=levels)
         self.at = at[self.slots.order]
         self._row = np.full(self.n_scenes, -1)
         self._row[self.scenes] = np.arange(len(self.scenes))

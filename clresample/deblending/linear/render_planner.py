@@ -9,7 +9,7 @@ import numpy as np
 
 from ...device.rounding import round_up
 from ...resampling.plan import Precision, make_resampling_plan
-from ...sky.mapping import PaddedMapping
+from ...sky.mapping import PaddedMapping, on_wide_pixels
 from .placing import place_windows, reach_of, wing_light
 from .renderer import BoxRenderer
 
@@ -34,7 +34,7 @@ class RenderRun:
     first, last: of the first slot, and of the last plus 1; renderer: None if no pixel is near
     plan_index (m,): index of each one's plan there; low (m, 2): first pixels of their windows
     lit_window (m, 4): first pixels and sizes of the parts of these that light reaches
-    offsets_px (m, 2) [model px]: distance of the pixels from those of the plan
+    offsets_px (m, 2) [px of the boxes]: distance of the pixels from those of the plan
     """
 
     first: int
@@ -97,6 +97,10 @@ class RenderPlanner:
         seen = np.maximum(flux, MIN_FLUX)[:, None] * np.array(wings)
         return np.maximum((seen < MISSED_SIGMAS).sum(axis=1) - 1, 0)
 
+    def allow_wide_pixels(self):
+        """Selects scenes (B,) in which boxes may have wide pixels."""
+        return ~self._distorted & (not self.is_exact)
+
     def runs(self, slots, level):
         """Yields the RenderRuns of slots; level (slots,): of their reaches."""
         # on distorted pixels each position has its own plan
@@ -122,7 +126,8 @@ class RenderPlanner:
         """Renderer and offsets of slots whose plans are those of all boxes of their shape."""
         scene, origin = slots.scene[first:last], slots.origin[first:last]
         shape, plan = tuple(slots.size[first].tolist()), self._plan[scene]
-        key = int(self._layout[scene[0]]), int(level), shape
+        pixel = int(slots.pixel[first])
+        key = int(self._layout[scene[0]]), int(level), shape, pixel
         windows, used = self._renderers.get(key), set(plan.tolist())
         if windows is None or not used <= windows.known:
             members = np.array(sorted(used if windows is None else used | windows.known))
@@ -132,15 +137,15 @@ class RenderPlanner:
             s: self.views[s].mapping.offset + self.views[s].op.shift for s in set(scene.tolist())
         }
         placed = np.array([own[s] for s in scene.tolist()])
-        off = placed - origin - windows.offset[which]
+        off = on_wide_pixels(placed - origin, pixel) - windows.offset[which]
         low, moves = place_windows(off, windows.matrix[which])
         lit = np.concatenate([low, windows.own[which]], axis=1)
         return windows.renderer, which, low - windows.before[which], lit, moves
 
-    def _windows(self, layout, level, shape, members):
+    def _windows(self, layout, level, shape, pixel, members):
         """The _Windows of the plans `members` for boxes of a shape, of one size for all scenes."""
         own = [
-            PaddedMapping.window_size(plan.mapping, shape, reach[level])
+            PaddedMapping.window_size(plan.mapping.on_pixels(pixel), shape, reach[level] / pixel)
             for plan, reach in zip(self._plans, self._reach, strict=True)
         ]
         alike, size = self._alike[layout], None
@@ -148,7 +153,7 @@ class RenderPlanner:
             most = np.max([own[i] for i in alike], axis=0)
             size = tuple(round_up(most, SIZE_PX).tolist())
         plans = [
-            self._plans[i].window(shape, self._reach[i, level], self.precision, size)
+            self._plans[i].window(shape, self._reach[i, level], self.precision, size, pixel)
             for i in members
         ]
         renderer = BoxRenderer(self.device, self.dtype, plans)

@@ -150,7 +150,8 @@ def _apart(around, listed, gain, at):
     listed (n): components; at: the places among them that compete
     """
     low, high = np.zeros((2, len(listed), 2))
-    low[around.at], high[around.at] = around.slots.origin, around.slots.origin + around.slots.size
+    slots = around.slots
+    low[around.at], high[around.at] = slots.origin, slots.origin + slots.pixel[:, None] * slots.size
     taken: list[int] = []
     for k in at[np.argsort(-gain[at], kind="stable")]:
         same = [j for j in taken if around.scene[j] == around.scene[k]]
