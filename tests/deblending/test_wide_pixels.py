@@ -36,10 +36,10 @@ def components(position, frame):
     return [StartComponent(0, 0, 0, GalaxyProfile(frame), np.array(position), frame.shape)]
 
 
-@pytest.mark.parametrize("ln_sigma, widest", [(np.log(1.2), 1), (np.log(5.0), 2), (np.log(20.0), 4)])
-def test_pixels_are_as_wide_as_the_profile_allows(ln_sigma, widest):
+@pytest.mark.parametrize("sigma_px, widest", [(1.2, 1), (5.0, 2), (20.0, 4)])
+def test_pixels_are_as_wide_as_the_profile_allows(sigma_px, widest):
     frame = Frame(sky_grid(SHAPE, 0.1), MODEL_PSF)
-    chosen, theta = components((130.0, 140.0), frame), [np.array([ln_sigma, 0.1, 0.2, 2.0])]
+    chosen, theta = components((130.0, 140.0), frame), [np.array([np.log(sigma_px), 0.1, 0.2, 2.0])]
     large, small = (np.array([[(10, 10), (side, side)]]) for side in (256, 128))
     assert pixels_of(chosen, theta, large, np.ones(1, bool)).tolist() == [widest]
     assert pixels_of(chosen, theta, large, np.zeros(1, bool)).tolist() == [1]
