@@ -20,7 +20,7 @@ from ..sky.observation import ZERO_POINT_UJY
 from ..sky.validation.checks import check_instance
 from ..sky.wcs import axis_names, celestial_frame, local_axes
 from .columns import Columns, definition
-from .photometry import add_groups, channel_covariances, flux_scale, fluxes
+from .photometry import add_groups, bounded_fluxes, channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, masked_cores, observation_labels
 from .shapes import moments, shape, shape_slopes
 
@@ -143,11 +143,12 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
     positions = result.frame.positions_of(result.sources)
     add_positions(table, result.frame.grid, positions, "")
-    bounded = flux if result.errors is None else flux - result.errors.flux_correction
+    bounded = np.where(np.isfinite(error), bounded_fluxes(result), np.nan)
     table.put("flags", _flags(result, bounded, error, positions, result.footprints))
     fitted = fitted_sources(result)
     with np.errstate(divide="ignore", invalid="ignore"):
-        snr = np.sqrt(np.nansum((flux / error)[:, of_bands] ** 2, axis=1))
+        positive = np.maximum(flux / error, 0)[:, of_bands]
+        snr = np.sqrt(np.nansum(positive**2, axis=1))
     table.put("snr", np.where(fitted, snr, np.nan))
     table.put("n_components", _counts(result))
     once = np.isin(np.arange(len(result.channels)), of_bands)  # exposures of a band count once

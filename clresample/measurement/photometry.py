@@ -19,9 +19,9 @@ def fluxes(result):
     over the components i of s and j of t: with morphologies fixed. If the result has Errors, the
     covariances are theirs, marginalised over morphologies. |S| then includes the light of the
     smooth profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The
-    bias of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, so
-    that F can be negative; F of a faint galaxy is its mean over sizes and wings that fit the data.
-    Both are `Errors.flux_correction`.
+    bias of F from the bounds of morphologies and spectra at 0 is subtracted, 0.1 to 1 % for bright
+    galaxies, so that F is negative for half of the sources without light; F of a faint galaxy is
+    its mean over sizes and wings that fit the data. Both are `Errors.flux_correction`.
 
     result: a fitted blend
     returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
@@ -30,11 +30,7 @@ def fluxes(result):
         others are 0
     """
     check_instance("result", result, Result)
-    sums = np.zeros((len(result.sources), len(result.components)))
-    for i, component in enumerate(result.components):
-        sums[component.source, i] = component.morphology.sum(dtype=np.float64)
-        if result.errors is not None:
-            sums[component.source, i] += result.errors.outside_box_moments[i, 0]
+    sums = _light_sums(result)
     flux = sums @ spectra_of(result)
     if result.errors is not None:
         flux = flux + result.errors.flux_correction
@@ -49,6 +45,21 @@ def fluxes(result):
     summed[i_channel, i_source, i_source] = np.nan
     flux[i_source, i_channel] = np.nan
     return flux, summed
+
+
+def bounded_fluxes(result):
+    """Fluxes (S, C) [counts] of the components, without corrections: none is negative."""
+    return _light_sums(result) @ spectra_of(result)
+
+
+def _light_sums(result):
+    """|S| (S, n) of the components of each source, see `fluxes`."""
+    sums = np.zeros((len(result.sources), len(result.components)))
+    for i, component in enumerate(result.components):
+        sums[component.source, i] = component.morphology.sum(dtype=np.float64)
+        if result.errors is not None:
+            sums[component.source, i] += result.errors.outside_box_moments[i, 0]
+    return sums
 
 
 def channel_covariances(result):

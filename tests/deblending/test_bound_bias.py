@@ -12,9 +12,10 @@ from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages, local_chi2
 from clresample.deblending.linear.rendered_models import RenderedModel
 from clresample.deblending.posterior.bound_bias import negative_chi2_gradient
-from clresample.measurement.photometry import fluxes
+from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.photometry import bounded_fluxes, fluxes
 from clresample.sky.frame import Frame
-from clresample.sky.sources import ExtendedSource
+from clresample.sky.sources import ExtendedSource, PointSource
 
 N_NOISES, FLUX, NOISE = 32, 300.0, 0.2
 
@@ -91,6 +92,29 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
     # each is known to 1 / sqrt(32 noises of 3 bands) = 0.1, their difference better
     assert before > 0.2 and abs(bias) < 0.6 * before, (bias, before)
+
+
+def test_fluxes_without_light_are_not_biased_by_noise(device):
+    """A galaxy's in a band that it drops out of, and a star's that is not there.
+
+    Models follow positive noise alone, so that their means are too high.
+    """
+    frame, middle, nothing = Frame(scenes.grids()[0], MODEL_PSF), (14.3, 17.6), (22.0, 27.0)
+    objects = ((middle, (FLUX, 0.0, FLUX), 2.2),)
+    noisy = [scenes.observe(objects, noise=NOISE, seed=seed) for seed in range(N_NOISES)]
+    listed = ExtendedSource(position_px=middle), PointSource(position_px=nothing)
+    results = deblend_many([Blend(tuple(o), listed, frame) for o in noisy], device=device)
+    dark = np.array([[False, True, False], [True, True, True]])
+    error = np.sqrt([np.einsum("css->sc", fluxes(r)[1]) for r in results])
+    pulls, before = (
+        np.array([each(r) for r in results])[:, dark] / error[:, dark]
+        for each in (lambda r: fluxes(r)[0], bounded_fluxes)
+    )
+    # each is known to 1 / sqrt(32 noises of 4 fluxes) = 0.09
+    assert abs(pulls.mean()) < 0.2 < before.mean() and 0.75 < pulls.std() < 1.25
+    flags = np.array([catalogue(r)["flags"] for r in results])
+    none = (np.array([bounded_fluxes(r) for r in results]) == 0).any(axis=2)
+    np.testing.assert_array_equal((flags & Flag.ZERO_FLUX) > 0, none)
 
 
 def test_chi2_is_that_where_a_components_light_is():

@@ -114,7 +114,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         scene=SimpleNamespace(channels=lambda: parts),
         ties=None,
     )
-    seen = RenderedModel(None, None, covariance, tuple(observed), (), power, slope)
+    seen = RenderedModel(None, None, covariance, tuple(observed), (), power=power, slope=slope)
     asked = colour_gradient._asked(fit, np.array([1]), seen)
     core = np.einsum("cj,jc->c", covariance[:, 2], slope)
     precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)

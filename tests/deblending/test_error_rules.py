@@ -169,7 +169,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     )
     fit.blend = SimpleNamespace(observations=[])
     seen = SimpleNamespace(
-        spectra=spectra, covariance=covariance, observed=(), residuals=lambda *_: []
+        spectra=spectra, covariance=covariance, observed=(), residuals=lambda *_: [], held=0
     )
     _, messages = posterior_module.posterior_of(fit, [], np.ones(2), seen)
     assert messages == []

@@ -54,6 +54,10 @@ class UnknownLayout:
         first = self.ties.first
         return np.where(np.isin(np.arange(len(weights)), first), weights, 0), weights[first]
 
+    def by_band(self, slopes):
+        """Slopes (B,) by the values of bands, of slopes (C,) by those of channels."""
+        return slopes if self.ties is None else self.ties.total(slopes)
+
     @property
     def n_spectra(self):
         """B."""

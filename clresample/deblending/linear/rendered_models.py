@@ -50,6 +50,8 @@ class RenderedModel:
         units
     observed: per view, ComponentImages (n, Co, My, Mx); unfiltered_views: likewise, None where it
         is the same
+    held (n, C): products of the whitened images with the residual, for spectra that the least
+        squares hold at 0, where they are not positive; 0 for others
     power, slope (n, C): products of the whitened images with themselves, and with what the model's
         own spectra and sky leave of the data; None without these
     """
@@ -59,6 +61,7 @@ class RenderedModel:
     covariance: np.ndarray
     observed: tuple[ComponentImages, ...]
     unfiltered_views: tuple
+    held: np.ndarray | None = None
     power: np.ndarray | None = None
     slope: np.ndarray | None = None
 
@@ -112,16 +115,18 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     others = [[b or v for b, v in zip(m.unfiltered_views, m.views, strict=True)] for m in models]
     if any(b is not None for m in models for b in m.unfiltered_views):
         bare = _taken(_rendered(models, others, False))
-    found = []
+    model = np.einsum("kcij,kcj->kci", looking.normal, looking.solution())
+    found, left = [], looking.right - model
     for b in range(len(models)):
-        at = looking.scene == b
+        spectra = looking.spectra[looking.scene == b]
         found.append(
             RenderedModel(
-                looking.spectra[at],
+                spectra,
                 looking.sky[b],
                 looking.covariance(b),
                 tuple(observed[b]),
                 tuple(bare[b]),
+                np.where(spectra == 0, left[b, :, : len(spectra)].T, 0),
                 *_products(looking, b, models[b]),
             )
         )

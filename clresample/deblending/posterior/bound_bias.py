@@ -1,9 +1,10 @@
-"""Bias of fluxes and sizes caused by the bound S >= 0.
+"""Bias of fluxes and sizes caused by the bounds S >= 0 and A >= 0.
 
 In a galaxy's wings structure follows positive noise, but not negative noise, because S >= 0. So the
-light of bright galaxies is 0.1 to 1 % too high, about half an error. At a pixel on the bound the
-gradient of the loss is not zero. The Newton step along the modes leads to the minimum without the
-bound, whose fluxes and moments do not have this bias.
+light of bright galaxies is 0.1 to 1 % too high, about half an error. The flux of a source without
+light in a band is 0 for negative noise, 0.3 to 0.5 of its error in the mean. At a pixel or spectrum
+on the bound the gradient of the loss is not zero. The Newton step along the modes and spectra leads
+to the minimum without the bounds, whose fluxes and moments do not have this bias.
 """
 
 from __future__ import annotations

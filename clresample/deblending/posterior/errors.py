@@ -38,9 +38,10 @@ class Errors:
         the sums of each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of
         the frame, if the morphology has its maximum 1
     flux_correction (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: corrections, not errors:
-        the changes of fluxes, and of centroids and second moments, without the bound of
-        morphologies at 0, see bound_bias.py; 0 for second moments of stars. Fluxes of faint
-        galaxies also have the change to their mean over sizes and wings, see start/shape_grid.py
+        the changes of fluxes, and of centroids and second moments, without the bounds of
+        morphologies and spectra at 0, see bound_bias.py; 0 for second moments of stars. Fluxes of
+        faint galaxies also have the change to their mean over sizes and wings, see
+        start/shape_grid.py
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     outside (S, C) [counts]: flux of the models outside the observed area, see `light_outside`; its
         square is included in `flux` and `colour`. 0 by default

@@ -84,6 +84,7 @@ class Solution:
     findings: StrengthEstimates; chi2 (n,): per pixel, in each component's light
     prior: MultiscalePrior
     negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None if `modes` is not called
+    held (n, C): see RenderedModel; None likewise
     """
 
     scene: Scene
@@ -99,6 +100,7 @@ class Solution:
     chi2: np.ndarray
     prior: MultiscalePrior
     negative_chi2_gradient: list | None = None
+    held: np.ndarray | None = None
 
     def structure_excess(self, i):
         """Strength of component i's structure over that of a galaxy like its smooth profile.

@@ -55,7 +55,8 @@ class Posterior:
     modes (n): (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
         BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the
         same nodes
-    released: arrays, for each node the changes of its unknowns without the bound of bound_bias.py
+    released: arrays, for each node the changes of its unknowns without the bounds at 0, see
+        bound_bias.py
 
     Raises LinAlgError where the matrix is not positive definite.
     """
@@ -84,9 +85,10 @@ class Posterior:
         """See the class; held (n): arrays (k,), gradients by each component's modes there."""
         right = [np.zeros(size) for size in self.layout.sizes]
         for i, pull in enumerate(held):
-            k = len(pull)
-            steps = np.sqrt(pull @ self.covariance.block(i, i)[:k, :k] @ pull)
-            right[i][:k] = pull * min(1, MAX_BOUND_RELEASE_SIGMA / max(steps, 1e-30))
+            k, own = len(pull), self.covariance.block(i, i)
+            right[i][:k] = pull * _release_factor(pull @ own[:k, :k] @ pull)
+            pull = self.layout.by_band(self.solution.held[i])
+            right[i][k:] = pull * _release_factor(pull**2 * np.diag(own)[k:])
         return self.factor.solve(right)
 
     def errors(self, owner, residuals, unit, flux_error_floor) -> Errors:
@@ -196,6 +198,11 @@ class Posterior:
         return out, moved
 
 
+def _release_factor(change):
+    """Factor of Newton steps with these expected changes of chi2, by MAX_BOUND_RELEASE_SIGMA."""
+    return np.minimum(1, MAX_BOUND_RELEASE_SIGMA / np.sqrt(np.maximum(change, 1e-60)))
+
+
 def with_errors(fit, result, peaks, seen):
     """The Result of a finished Fit with Errors and PosteriorSampler, or messages instead.
 
@@ -271,6 +278,7 @@ def posterior_of(fit, morphs, peaks, seen):
         local_chi2(seen.observed, fit.views, channels, spectra, residuals),
         settings.prior,
         negative_chi2_gradient(scene, fit.views, fit.start.source, seen.spectra, residuals),
+        seen.held,
     )
     try:
         sky, shifts = settings.fit_sky, settings.fit_shifts

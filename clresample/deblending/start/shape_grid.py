@@ -88,7 +88,7 @@ class ShapeGrid:
     """Alternative profiles of one component, the present one first; see the module's text.
 
     scene, index: of the component; theta (K, 4); gain (K,); flux, variance (K, C): in the frame,
-        in the views' units, the latter by noise alone
+        in the views' units, the first b / p of both signs, the latter by noise alone
     """
 
     scene: int
@@ -196,9 +196,9 @@ def _computed(fit, components):
         right, alone = right - part * off, alone - part * sky
     if looking.ties is not None:
         right, alone = (looking.ties.spread(looking.ties.total(a)) for a in (right, alone))
-    right = np.maximum(right, 0)
     flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
-    gain = right * flux if looking.ties is None else (right * flux)[:, looking.ties.first]
+    gain = np.maximum(right, 0) * flux
+    gain = gain if looking.ties is None else gain[:, looking.ties.first]
     inside = part_inside(listed, theta)[:, None]
     variance = np.divide(inside**2, alone, out=np.zeros_like(alone), where=alone > 0)
     parts = gain.sum(axis=1), flux * inside, variance
