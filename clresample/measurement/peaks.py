@@ -17,7 +17,7 @@ N_LEVELS, MIN_CONTRAST = 256, 1e-6
 # [1] Smallest light of an object above its saddle, in that of all connected pixels: clumps of large
 # galaxies have less. In a crowd so have sources of signal to noise up to 900, so that there the
 # brightest object's light counts, if that has at most COMPACT areas of a point source. Objects of
-# more areas that rise by the threshold and by STEEP of their saddle are satellites: of 149 clumps
+# more areas that rise by the threshold and by STEEP of their saddle are satellites: of 144 clumps
 # with less light two have so many areas.
 MIN_PART, COMPACT, STEEP = 0.001, 3.0, 0.2
 # [sigma] Smallest height of an object above its saddle: the noise has bumps of one.
