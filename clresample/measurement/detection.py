@@ -182,7 +182,8 @@ def _without_structure(result, found, known, places, threshold):
         for image in (result.model(sharp) - sky, result.residual(sharp))
     )
     inside = known[frame.contains(known)]
-    bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold, frame.grid.pixel_scale_arcsec)
+    scale = frame.grid.pixel_scale_arcsec
+    bodies = bodies_of(light + rest, inside, _fwhm_px(o, frame), threshold, scale)
     kept, hosts = [], []
     for i, source in enumerate(found.sources):
         number = bodies.body_at(np.array(source.position_px))

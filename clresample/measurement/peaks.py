@@ -16,8 +16,10 @@ from .hills import root, saddles, watershed
 N_LEVELS, MIN_CONTRAST = 256, 1e-6
 # [1] Smallest light of an object above its saddle, in that of all connected pixels: clumps of large
 # galaxies have less. In a crowd so have sources of signal to noise up to 900, so that there the
-# brightest object's light counts, if that has at most COMPACT areas of a point source.
-MIN_PART, COMPACT = 0.001, 3.0
+# brightest object's light counts, if that has at most COMPACT areas of a point source. Objects of
+# more areas that rise by the threshold and by STEEP of their saddle are satellites: of 144 clumps
+# with less light two have so many areas.
+MIN_PART, COMPACT, STEEP = 0.001, 3.0, 0.2
 # [sigma] Smallest height of an object above its saddle: the noise has bumps of one.
 MIN_RISE = 2.0
 # [1] of an object's brightest pixel: its highest local maximum. sep shares out pixels between
@@ -38,15 +40,16 @@ def import_sep():
     return sep
 
 
-def new_peaks(sep, image, threshold, area, fwhm, known, apart, *, own=True):
+def new_peaks(sep, image, threshold, area, fwhm, known, apart, *, own=True, first=False):
     """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first.
 
     area [px]: smallest area of an object; fwhm [px]: of the PSF
     known: positions (2,) of sources; objects whose peak is within `apart` [px] of one are left out
     own: also leave out objects that contain a known source: under a wide filter a pair of sources
         is one object with its peak between them
+    first: also take wide objects of little light, see STEEP; later images have steps of levels
     """
-    objects, segments = _objects(sep, image, threshold, area, fwhm)
+    objects, segments = _objects(sep, image, threshold, area, fwhm, first)
     places = np.array(known).reshape(-1, 2)
     at = np.clip(np.rint(places).astype(int), 0, np.array(image.shape) - 1)
     taken = set(segments[at[:, 0], at[:, 1]].tolist()) if own else set()
@@ -58,7 +61,7 @@ def new_peaks(sep, image, threshold, area, fwhm, known, apart, *, own=True):
     return sorted(found, key=lambda one: -one[1])
 
 
-def _objects(sep, image, threshold, area, fwhm):
+def _objects(sep, image, threshold, area, fwhm, first=False):
     """sep's objects: (position (y, x), height) of each, and their numbers in pixels (Ny, Nx).
 
     From 1, 0 = none.
@@ -79,15 +82,15 @@ def _objects(sep, image, threshold, area, fwhm):
         ),
     )
     peaks = [(np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects]
-    return _without_structure(image, threshold, POINT_AREA * fwhm**2, peaks, segments)
+    return _without_structure(image, threshold, POINT_AREA * fwhm**2, peaks, segments, first)
 
 
-def _without_structure(image, threshold, point_area, peaks, segments):
+def _without_structure(image, threshold, point_area, peaks, segments, first):
     """Objects and their numbers, see `_objects`, without faint ones on the light of brighter ones.
 
     The pixels of those are in no object.
 
-    point_area [px]: a point source's light over its peak
+    point_area [px]: a point source's light over its peak; first: also take wide ones
     """
     if len(peaks) < 2:
         return peaks, segments
@@ -103,7 +106,9 @@ def _without_structure(image, threshold, point_area, peaks, segments):
     top = np.array(ndimage.maximum_position(light, own, np.arange(n)), int)[own, 0]
     compact = light[top] < COMPACT * point_area * height[top]
     whole = np.where(compact, light[top], ndimage.sum_labels(image, of, np.arange(n) + 1)[own])
-    kept = (light >= MIN_PART * whole) & (height >= base + MIN_RISE)
+    rise = height - base
+    wide = (light > COMPACT * point_area * rise) & (rise > np.maximum(threshold, STEEP * base))
+    kept = ((light >= MIN_PART * whole) | (first & wide)) & (rise >= MIN_RISE)
     kept &= height >= MIN_TOP * np.array([peak for _, peak in peaks])
     number[1:] = np.where(kept, np.cumsum(kept), 0)
     found = [(at[i].astype(float), float(height[i])) for i in np.flatnonzero(kept)]

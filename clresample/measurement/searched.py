@@ -41,7 +41,8 @@ class Search:
         """Adds the new peaks of an image, except those on bodies searched before."""
         before = self.known + self.positions + self.clumps
         area, apart = MIN_AREA * narrow**2, SAME_SOURCE * wide
-        for position, peak in new_peaks(self.sep, image, self.threshold, area, wide, before, apart):
+        given, first = (image, self.threshold, area, wide, before, apart), not self.positions
+        for position, peak in new_peaks(self.sep, *given, first=first):
             if self.bodies.body_at(position) < 0:
                 self._put(position, peak, label)
 

@@ -6,7 +6,7 @@ from helpers.blends import blend
 from scipy import ndimage
 
 from clresample.deblending.result import Component
-from clresample.measurement.clumps import bodies_of, small_bodies_of
+from clresample.measurement.clumps import _Tree, bodies_of, small_bodies_of
 from clresample.measurement.columns import Columns
 from clresample.measurement.hills import saddles
 from clresample.measurement.photometry import group_fluxes, whole_groups
@@ -32,13 +32,19 @@ def disk(size, height=400.0, at=MIDDLE):
     return height * np.exp(-1.678 * np.maximum(away - 2, 0) / size)
 
 
+def spiral(size):
+    """A disk with two arms."""
+    y, x = np.indices((SIZE, SIZE)) - SIZE / 2
+    return disk(size) * (1 + 0.6 * np.cos(2 * np.arctan2(y, x) - np.hypot(y, x) / 5))
+
+
 def judged(image, places, scale=0.1):
     return bodies_of(image, np.array(places), FWHM, 5.0, scale)
 
 
 def test_a_weak_peak_in_a_disk_is_structure_and_a_strong_one_a_member():
     weak, strong = (60, 80), (42, 60)
-    image = disk(20) + point(weak, 60) + point(strong, 1800)
+    image = spiral(20) + point(weak, 60) + point(strong, 1800)
     found = judged(image, [MIDDLE, weak, strong])
     assert len(found.bodies) == 1
     assert found.bodies[0].center.tolist() == MIDDLE.tolist()
@@ -49,9 +55,26 @@ def test_a_weak_peak_in_a_disk_is_structure_and_a_strong_one_a_member():
 
 def test_a_weak_peak_on_so_large_a_galaxy_that_there_are_others_by_chance_is_a_source():
     weak = (60, 80)
-    image = disk(20) + point(weak, 160)
+    image = spiral(20) + point(weak, 80)
     assert judged(image, [MIDDLE, weak], scale=0.1).structure[1]
     assert not judged(image, [MIDDLE, weak], scale=0.4).structure[1]
+
+
+@pytest.mark.parametrize("galaxy, is_structure", [(disk, False), (spiral, True)])
+def test_a_peak_of_its_hosts_light_is_structure_unless_the_host_is_smooth(galaxy, is_structure):
+    peak = (60, 80)
+    image = galaxy(20)
+    found = judged(image + point(peak, image[peak]), [MIDDLE, peak])
+    assert found.structure.tolist() == [False, is_structure] and found.owners.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("heights", [(20.0, 90.0), (90.0, 20.0)])
+def test_light_around_two_galaxies_is_the_brighter_ones(heights):
+    basins = np.array([[1, 1, 1, 2, 2, 2, 3]])
+    tree = _Tree(np.repeat([*heights, 9.0], [3, 3, 1])[None], basins, 2)
+    tree.join(0, 1, 10.0)
+    tree.join(0, 2, 8.0)
+    assert tree.levels[tree.body[2]] == 90
 
 
 def test_a_faint_galaxys_peaks_stay_sources_of_its_group():

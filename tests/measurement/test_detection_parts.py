@@ -139,6 +139,17 @@ def test_the_brightest_peak_comes_first():
     assert [peak for _, peak in peaks.new_peaks(sep, image, 5.0, 1, 3.0, [], 1.0)] == [30, 15, 9]
 
 
+@pytest.mark.parametrize("width, first, n", [(3.5, True, 2), (3.5, False, 1), (0.9, True, 1)])
+def test_a_wide_object_of_little_light_on_a_galaxy_is_found_by_the_first_search(width, first, n):
+    import sep
+
+    y, x = np.indices((160, 160)) - 80.0
+    galaxy = 3000 / (1 + (y**2 + x**2) / 60)
+    other = 30 * np.exp(-((y - 50) ** 2 + (x - 50) ** 2) / (2 * width**2))
+    image = (galaxy + other).astype(np.float32)
+    assert len(peaks.new_peaks(sep, image, 5.0, 1, 2.0, [], 1.0, first=first)) == n
+
+
 def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
     class NotAsked:
         def extract(self, *_args, **_given):

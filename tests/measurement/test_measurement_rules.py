@@ -102,7 +102,7 @@ def test_objects_have_a_quarter_of_the_square_of_their_images_fwhm(monkeypatch):
     pytest.importorskip("sep")
     given = []
 
-    def searched(_sep, _image, threshold, area, _fwhm, _known, apart, own=True):
+    def searched(_sep, _image, threshold, area, _fwhm, _known, apart, **_more):
         given.append((threshold, area, apart))
         return []
 
