@@ -9,10 +9,10 @@ import numpy as np
 from ..sky.box import Box
 
 AREAS = "auto", "all", "finest"
-# Largest number of model pixels of an area "auto", in those of the mosaic with the smallest pixels.
-# The search takes time and disk in proportion to it. Images of a pointing, cut to about one size and
-# turned, have up to 8; a ground-based image around a cutout of a space telescope has hundreds.
-MAX_GROWTH = 16
+# Largest area "auto", in that of the mosaic with the smallest pixels: others may be twice as wide,
+# however they are turned. The search takes time and disk in proportion; a ground-based image around
+# a cutout of a space telescope has hundreds.
+MAX_GROWTH = 8
 N_SAMPLES = 33  # pixels along each axis of a mosaic that are placed
 PLACED_PX = 0.1  # [px] largest error of a pixel that is placed there and back
 
