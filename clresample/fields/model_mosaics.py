@@ -20,10 +20,10 @@ def write_mosaics(folder, job, parts, last):
     Of a part of a field, they are those pixels that lie on the part. Raises FileError where a file
     cannot be written.
     """
-    paths, whole = [], job.core == Box.of(job.reference.shape)
+    paths = []
     core = job.reference.cutout(job.core.y0, job.core.x0, job.core.shape)
     for i_mosaic, mosaic in enumerate(job.mosaics):
-        here = Box.of(mosaic.grid.shape) if whole else mosaic.box_on(core)
+        here = Box.of(mosaic.grid.shape) if not job.is_part else mosaic.box_on(core)
         if not here.area:
             continue
         shape = len(mosaic.channels), *here.shape

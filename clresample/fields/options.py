@@ -9,6 +9,7 @@ import numpy as np
 
 from ..deblending.settings import FitSettings, Settings
 from ..measurement.detection import THRESHOLD
+from .area import AREAS
 from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
 
@@ -29,6 +30,9 @@ class FieldOptions:
         residuals too
     positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of known
         sources, or a SkyCoord of S positions; None = detect sources
+    area: sky whose sources are in the catalogue: "all", that of all mosaics; "finest", that of the
+        mosaic with the smallest pixels; "auto", the first unless it has over MAX_GROWTH times as
+        many model pixels. Beyond "finest", `margin_px` are searched and fitted too
     part (i, n): run only the i-th of n parts of the field (from 1), for job arrays: its catalogue
         has the sources whose centres lie in it; None = the whole field
     margin_px [model px]: width of the border around the part that is searched and fitted too.
@@ -51,6 +55,7 @@ class FieldOptions:
     threshold: float = THRESHOLD
     passes: int = 2
     positions: np.ndarray | None = None
+    area: str = "auto"
     part: tuple[int, int] | None = None
     margin_px: int = 256
     tile_px: int = 1024
@@ -68,6 +73,8 @@ class FieldOptions:
     def __post_init__(self):
         if self.passes not in (1, 2):
             raise ValueError(f"passes is {self.passes}, must be 1 or 2")
+        if self.area not in AREAS:
+            raise ValueError(f"area is {self.area!r}, must be {', '.join(map(repr, AREAS))}")
         if not 0 <= self.field_number <= LARGEST_FIELD:
             raise ValueError(f"field_number is {self.field_number}, must be 0 to {LARGEST_FIELD}")
         if self.workers < 0:

@@ -13,16 +13,16 @@ from astropy.coordinates import SkyCoord
 
 from ..deblending.ended import Ended
 from ..deblending.settings import AUTO, SMALL
-from ..sky.box import Box
 from ..sky.validation.checks import check_instance, check_sequence
 from ..sky.wcs import celestial_frame
+from .area import field_area
 from .blends.tiles import field_part
 from .execution.backend import make_backend
 from .execution.fitting import FieldJob
 from .execution.folder import open_folder
 from .execution.rounds import fit_all_groups
 from .execution.search_setup import prepare_search, read_search_setup
-from .execution.searching import load_or_make_plan
+from .execution.searching import known_positions, load_or_make_plan
 from .hats import check_hats
 from .mosaic import Mosaic
 from .options import MIN_MEMORY, FieldOptions, RunProgress
@@ -77,16 +77,19 @@ def run_field(
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
     )
-    whole, clock = Box.of(reference.shape), _Clock(seconds)
-    settings, notes = options.settings, list[str]()
+    clock, settings = _Clock(seconds), options.settings
+    wanted, searchable, notes = field_area(
+        mosaics, reference, options.area, known_positions(options.positions, reference)
+    )
     if settings.fit_sky == AUTO:
         found = measured_sky(mosaics, work)
-        notes = sky_notes(mosaics, found)
+        lowered = sky_notes(mosaics, found)
+        notes += tuple(lowered)
         mosaics = without_sky(mosaics, {name: level for name, (level, _) in found.items()})
         measured = all(c.name in found for m in mosaics for c in m.channels)
-        settings = replace(settings, fit_sky=SMALL if notes and measured else AUTO)
-    core = whole if options.part is None else field_part(whole, *options.part)
-    region = core if options.part is None else core.grown(options.margin_px).intersection(whole)
+        settings = replace(settings, fit_sky=SMALL if lowered and measured else AUTO)
+    core = wanted if options.part is None else field_part(wanted, *options.part)
+    region = core.grown(options.margin_px).intersection(searchable)
     engine = make_backend(options, progress)
     try:
         prepare_search(mosaics, reference, work, engine)
@@ -102,6 +105,7 @@ def run_field(
             plan=plan,
             origin_px=(region.y0, region.x0),
             core=core,
+            is_part=core != wanted,
             settings=settings,
             threshold=options.threshold,
             passes=options.passes,

@@ -55,7 +55,7 @@ class Source:
             raise ValueError(f"sky_frame is {self.sky_frame!r:.80}, must be {ICRS.name!r} or None")
         given = getattr(self, name)
         position = as_float_array(name, given, "deg" if name == "sky_deg" else "pix")
-        plain = isinstance(given, list | tuple) and not any(hasattr(v, "unit") for v in given)
+        plain = isinstance(given, list | tuple) and all(type(v) in (int, float) for v in given)
         if not plain and position.shape == (2,):
             object.__setattr__(self, name, tuple(map(float, position)))
         if position.shape != (2,) or not np.isfinite(position).all():

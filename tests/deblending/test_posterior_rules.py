@@ -264,7 +264,8 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
     """The first image of a component is its morphology, the others are its modes."""
     monkeypatch.setattr(posterior, "normal_matrix", lambda *given: given[-2])
     asked = []
-    known = SimpleNamespace(block=lambda i, j: np.diag([4.0, 0.25, 1, 1, 1, 1, 1]) / 2)
+    variances = [0.5] * 5, [2.0, 0.125] + [0.5] * 5
+    known = SimpleNamespace(block=lambda i, j: np.diag(variances[i]))
     factor = SimpleNamespace(inverse=lambda: known, solve=asked.append)
     monkeypatch.setattr(posterior, "BlockCholesky", lambda _: factor)
     images = [np.arange(k).reshape(k, 1, 1) for k in (1, 3)]

@@ -203,6 +203,8 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + "variance = [1, 2]", "variance has 2 planes, the images 1"),
         (ONE + "variance = 1\nweight = 1", "weight and variance are both given"),
         (ONE + 'weight_hdu = "WHT"', "weight_hdu is given, but weight names no file"),
+        (ONE + "rms = 1\nvariance_hdu = 1", "variance names no file: the HDU of rms is rms_hdu"),
+        (ONE + "weight = 1\nrms_hdu = 1", "rms names no file: the HDU of weight is weight_hdu"),
         (ONE + 'weight = "none.fits"', "none.fits: no such file"),
         (ONE + 'weight = "image.fits"', "weight_hdu must say which HDU"),
         (ONE + 'weight = "psf.fits"', "weight has (21, 21) pixels"),

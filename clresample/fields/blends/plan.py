@@ -136,11 +136,10 @@ def source_ids(positions, field_number=0) -> np.ndarray:
         id = (field number << 40) + (row << 20) + column
 
     of the source's pixel: the same in every run over the field, whole or in parts. Rows and columns
-    are those of the model's grid, 0 to 1,048,575; a source outside gets the nearest one. If an id
+    are those of the model's grid, modulo 1,048,576: negative ones count from there down. If an id
     is taken, the next free column is used, in the order of the positions.
     """
-    most = (1 << POSITION_BITS) - 1
-    at = np.clip(nearest(positions).astype(np.int64), 0, most)
+    at = nearest(positions).astype(np.int64) % (1 << POSITION_BITS)
     base = (int(field_number) << 2 * POSITION_BITS) + (at[:, 0] << POSITION_BITS)
     ids, used = base + at[:, 1], set()
     for i, one in enumerate(ids.tolist()):

@@ -106,21 +106,32 @@ def snr_scatter(mosaics, reference) -> dict:
     """{mosaic's name: scatters of its signal to noise without sources}, from the field's middle.
 
     A list from `noise_scatter` for each mosaic, valid for the whole field, so that detections do
-    not depend on the division into tiles.
+    not depend on the division into tiles. The middle is that of the mosaic with the smallest
+    pixels; mosaics without pixels there are measured in their own.
     """
     region = Box.of(reference.shape)
-    middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
-    box = Box(*middle, *middle).grown(SAMPLE_PX // 2).intersection(region)
-    found = {mosaic.name: [1.0] * len(WIDTHS_ARCSEC) for mosaic in mosaics}
+    found = _scatters_about(np.array(region[2:]) // 2, mosaics, reference, region)
+    for mosaic in mosaics:
+        if mosaic.name not in found:
+            middle = mosaic.grid.positions_in(reference, *((np.array(mosaic.grid.shape) - 1) / 2))
+            found |= _scatters_about(middle, [mosaic], reference)
+    return {mosaic.name: found.get(mosaic.name, [1.0] * len(WIDTHS_ARCSEC)) for mosaic in mosaics}
+
+
+def _scatters_about(middle, mosaics, reference, region=None):
+    """{name: `noise_scatter`} of the mosaics with pixels about a position (2,) [px] of a region."""
+    if not np.isfinite(middle).all():
+        return {}
+    box = Box.at(nearest(middle)[0], (0, 0)).grown(SAMPLE_PX // 2)
+    box = box if region is None else box.intersection(region)
     try:
         observations = observations_on(mosaics, reference, box)
     except FileError:  # the search of its tile reports it
-        return found
-    if observations:
-        frame = model_frame(observations, grid=_cut(reference, box))
-        for o in observations:
-            found[o.name] = noise_scatter(o, frame).tolist()
-    return found
+        return {}
+    if not observations:
+        return {}
+    frame = model_frame(observations, grid=_cut(reference, box))
+    return {o.name: noise_scatter(o, frame).tolist() for o in observations}
 
 
 def observations_on(mosaics, reference, box):

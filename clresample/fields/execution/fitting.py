@@ -63,7 +63,8 @@ class FieldJob:
 
     mosaics, reference: of the field; folder: of its parts; plan: FitPlan
     origin_px (2,) [px]: (y, x) of the first pixel of labels.npy in the model's pixels
-    core: Box of the model's pixels whose sources enter the catalogue
+    core: Box of the model's pixels whose sources enter the catalogue; is_part: whether it is a part
+        of the field's area
     settings: of the fits; threshold [sigma]: of the second pass; passes: 1, or 2 to search the
         residuals too; memory [bytes]: of the device; device: as `get_device` takes it
     field_number: of the ids
@@ -75,6 +76,7 @@ class FieldJob:
     plan: FitPlan
     origin_px: tuple[int, int]
     core: Box
+    is_part: bool = False
     settings: FitSettings = Settings()
     threshold: float = 5.0
     passes: int = 2

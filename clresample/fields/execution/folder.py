@@ -13,7 +13,7 @@ from ..sky_level import FILE as SKY_FILE
 from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
-FORMAT = 10  # of that folder; raised when another version would misread it
+FORMAT = 11  # of that folder; raised when another version would misread it
 
 
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
@@ -76,6 +76,7 @@ def _fingerprint(mosaics, reference, options, inputs):
         "threshold": options.threshold,
         "passes": options.passes,
         "sources": None if positions is None else np.round(positions, 9).tolist(),
+        "area": options.area,
         "part": options.part and [*options.part, options.margin_px],
         "tile_px": options.tile_px,
         "overlap_px": options.overlap_px,

@@ -57,7 +57,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
 
     def found(number):
         if str(number) in lost:
-            return _lost(tiles[number], _given_px(options.positions, reference))
+            return _lost(tiles[number], known_positions(options.positions, reference))
         return _read_found(work, number)
 
     everything = [found(tile.number) for tile in tiles]
@@ -97,7 +97,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
 
 def _searched(mosaics, reference, tiles, work, options, engine, progress):
     """Searches the remaining tiles; returns {number: reason} of those that failed."""
-    positions = _given_px(options.positions, reference)
+    positions = known_positions(options.positions, reference)
     todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
     progress.stage("search", len(tiles))
     progress.step(len(tiles) - len(todo))
@@ -124,7 +124,7 @@ def _searched(mosaics, reference, tiles, work, options, engine, progress):
     return lost
 
 
-def _given_px(positions, reference):
+def known_positions(positions, reference):
     """Positions (S, 2) [px] in the reference's pixels of a catalogue's (S, 2) [deg], or None."""
     if positions is None:
         return None

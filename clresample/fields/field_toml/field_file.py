@@ -61,7 +61,9 @@ def read_field(path) -> FieldFile:
 def _options(path, tables, inputs):
     """FieldOptions of the tables other than the mosaics'."""
     about, limits = tables["field"], FitLimits()
-    given = {key: about[key] for key in ("tile_px", "overlap_px", "margin_px") if key in about}
+    given = {
+        key: about[key] for key in ("area", "tile_px", "overlap_px", "margin_px") if key in about
+    }
     given |= tables["detection"]
     if "sources" in tables and tables["sources"]:
         inputs["sources"] = path.parent / tables["sources"]["catalogue"]

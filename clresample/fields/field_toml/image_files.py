@@ -91,12 +91,14 @@ class ImageFiles:
 
     def weights(self, bands):
         """Planes of weights, variances or RMS, and which of them; None where there are none."""
-        for kind in WEIGHTS:
-            if kind in self.table:
-                return [plane for plane, _ in self._of_key(kind, bands)], kind
-            if f"{kind}_hdu" in self.table:
-                raise ValueError(f"{kind}_hdu is given, but {kind} names no file")
-        return [None] * len(bands.chosen), "weight"
+        kind = next((kind for kind in WEIGHTS if kind in self.table), None)
+        for other in WEIGHTS:
+            if other != kind and f"{other}_hdu" in self.table:
+                hint = "" if kind is None else f": the HDU of {kind} is {kind}_hdu"
+                raise ValueError(f"{other}_hdu is given, but {other} names no file{hint}")
+        if kind is None:
+            return [None] * len(bands.chosen), "weight"
+        return [plane for plane, _ in self._of_key(kind, bands)], kind
 
     def masks(self, bands):
         """Planes of masks, and the bits of each that mean: ignore."""

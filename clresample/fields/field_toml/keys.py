@@ -31,6 +31,7 @@ from ...files.scene_keys import (
     one_or_many_schema,
     read_tables,
 )
+from ..area import AREAS
 from ..plugins import Formats
 from ..psfs.read import FORMATS
 from ..readers.formats import READERS
@@ -159,6 +160,11 @@ FIELD_TABLES = {
     "mosaic": IMAGE,
     "field": {
         "field_number": COUNT,
+        "area": KeyRule(
+            " or ".join(f'"{area}"' for area in AREAS),
+            lambda value: value in AREAS,
+            {"enum": list(AREAS)},
+        ),
         "tile_px": COUNT,
         "overlap_px": COUNT,
         "margin_px": COUNT,

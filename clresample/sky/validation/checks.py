@@ -114,14 +114,16 @@ def check_number(name, value, what="a finite number", fits=math.isfinite) -> flo
     """Returns one number as a float. Raises ValueError unless `fits`, described by `what`."""
     found = as_float_array(name, value)
     if found.shape != () or not fits(float(found)):
-        raise ValueError(f"{name} is {value!r:.80}, must be {what}")
+        raise ValueError(f"{name} is {plain_repr(value):.80}, must be {what}")
     return float(found)
 
 
 def check_integer(name, value, least=0) -> int:
     """Returns an integer of at least `least`. Raises ValueError for any other value."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise ValueError(f"{name} is {value!r:.80}, must be a whole number, {least} or more")
+        raise ValueError(
+            f"{name} is {plain_repr(value):.80}, must be a whole number, {least} or more"
+        )
     if value < least:
         raise ValueError(f"{name} is {value}, must be {least} or more")
     return int(value)
@@ -165,12 +167,17 @@ def check_sequence(name, values, kind=object) -> tuple:
     return values
 
 
+def plain_repr(value) -> str:
+    """The repr of a value for messages; that of a NumPy scalar is its number's."""
+    return repr(value.item() if isinstance(value, np.generic) else value)
+
+
 def described(value) -> str:
     """Describes a value in a few words for messages; arrays by type and shape alone."""
     kind, shape = type(value).__name__, getattr(value, "shape", None)
     if shape is not None and np.ndim(shape) == 1 and len(shape):
         return f"of type {kind} and shape {tuple(shape)}"
-    text = repr(value)
+    text = plain_repr(value)
     if isinstance(value, str | int | float | bool | None):
         return f"{text:.80} ({kind})"
     if "\n" in text or len(text) > 80:
