@@ -1,4 +1,4 @@
-/* Stages of the operator for grids that are rotated, sheared or distorted against each other.
+/* Stages of the operator for grids that are rotated or sheared against each other.
  *
  * gather   target[b, l, p] = sum_t weight[l, t, p] * source[b, l, start[l, p] + t]
  *          Line by line, in both directions: from the columns of pass 1 to the observed pixels of a
@@ -14,8 +14,7 @@
  *
  * rowdot   y[b, p] = sum_x<n T[b, p, x] * E[p, x]        launch: (n_positions rounded up, batch)
  * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (elements rounded up, batch)
- *          The two ends of the executor for any positions: each observed pixel p has a table row
- *          E[p] of its own.
+ *          Sums at any positions: each position p has a table row E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero from n on, of which
  *   rowdot reads whole eights
  *

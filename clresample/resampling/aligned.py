@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..device.contraction import ImageBatch, row_stride
 from .executor import Executor
 
@@ -13,7 +15,8 @@ class AlignedExecutor(Executor):
     """
 
     def __init__(self, device, dtype, plans):
-        self.n_rows, self.n_columns = plans[0].mapping.shape_out
+        sides = [(len(p.out_y), p.out_x.shape[1]) for p in plans]
+        self.n_rows, self.n_columns = np.max(sides, axis=0).tolist()
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, row_stride(self.n_columns))
 

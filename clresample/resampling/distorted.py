@@ -1,60 +1,98 @@
-"""Executor of any positions: the sum over frequencies for each observed pixel."""
+"""Executor of any positions: a finer plane along the model's axes, interpolated at each pixel."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..device.contraction import ImageBatch
-from .executor import Executor
+from ..device.rounding import round_up
+from .aligned import AlignedExecutor
+from .wave_tables import TAPS_PAD
+
+# Observed pixels of a work-item on CPUs: so many that its start takes no time.
+RUN_PX = 64
 
 
-class DistortedExecutor(Executor):
-    """Any positions: the sum over frequencies straight at each of the P = My Mx observed pixels.
+class DistortedExecutor(AlignedExecutor):
+    """Any positions: the rows and columns of a finer plane, then a sparse sum for each pixel.
 
-    Sy (P, ky), Sx (P, kx): waves at the pixels, Sy times the pixel's area
+    Sy (I, ky), Sx (kx, J): waves at the rows and columns of the plane, about its middle
+    points: from the plane to the P = My Mx observed pixels, and back
     """
 
-    bounded = False  # its sums along a pixel's row of tables run over all columns
-
     def __init__(self, device, dtype, plans):
-        self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
-        self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
+        self.points = PointInterpolation(self, [plan.points for plan in plans])
 
-    def bind(self):
-        super().bind()
-        half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
-        self.to_rows = self.product().bind(
-            self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
-        )
-        self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
+    def mirrored(self, name) -> bool:
+        """As the base's; planes of several sizes have no common middle."""
+        sides = {(len(plan.out_y), plan.out_x.shape[1]) for plan in self.plans}
+        return super().mirrored(name) and (len(sides) == 1 or name.startswith("in"))
 
-    def bind_adjoint(self):
-        super().bind_adjoint()
-        half = self.matrix("half", self.n_rows)
-        out_y_t = self.cached("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
-        product = self.product(**self.adjoint_options())
-        self.from_rows = self.to_frequencies(product, self.n_rows, out_y_t, half)
-        self.rowscale = self._rows("rowscale", (self.tuning.line_group, 1), half)
-
-    def _rows(self, name, local_size, half):
-        """A kernel over the pixels' rows of tables."""
-        return self.device.launcher("warp.cl", name, dtype=self.dtype, local_size=local_size).bind(
-            n_positions=self.n_rows,
-            n_pad=self.k_pad,
-            n_bands=self.n_bands,
-            n_tables=len(self.plans),
-            T=half.buffer,
-            E=self.out_x.buffer,
-        )
+    def scratch_shapes(self):
+        return super().scratch_shapes() | {"plane": (self.n_rows, self.n_columns)}
 
     def frequencies_to_pixels(self, y: ImageBatch, n):
-        """I2[p] = sum_x (Sy Z)[p, x] Sx[p, x];  y (n, P): the observation I2 of each band"""
-        self.to_rows(n)
-        self.rowdot((self.whole_groups(self.n_rows), n), y=y.buffer, y_offset=y.offset)
+        """I2 = gather(G),  G = Sy Z Sx;  y (n, P): the observation I2 of each band, overwritten"""
+        super().frequencies_to_pixels(self._plane, n)
+        self.points.to_pixels(self._plane, y, n, self.which)
 
     def pixels_to_frequencies(self, y: ImageBatch, n):
-        """Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x];  y (n, P): I2"""
-        size = self.whole_groups(self.k_pad * self.n_rows), n
-        self.rowscale(size, y=y.buffer, y_offset=y.offset)
-        self.from_rows(n)
+        """Z = conj(D) o (Sy^T G Sx^T),  G = gather^T(I2);  y (n, P): I2"""
+        self.points.to_plane(y, self._plane, n, self.which)
+        super().pixels_to_frequencies(self._plane, n)
+
+    @property
+    def _plane(self) -> ImageBatch:
+        """G, in scratch "plane"."""
+        shape = self.n_rows, self.n_columns
+        return ImageBatch.shaped(*shape)._replace(buffer=self.scratch["plane"].base_data)
+
+
+class PointInterpolation:
+    """Sparse sums from planes (I, J) to pixels anywhere on them, and their transpose.
+
+    points: PointTaps of each plan
+    """
+
+    def __init__(self, executor, points):
+        device, dtype, tuning = executor.device, executor.dtype, executor.tuning
+        self.n_rows, self.n_columns = executor.n_rows, executor.n_columns
+        self.n_positions = math.prod(executor.plans[0].mapping.shape_out)
+        self.by_run, self.whole_groups = tuning.row_loops, executor.whole_groups
+        n, n_most, n_taps = len(points), max(len(p.pixel) for p in points), points[0].n_taps
+        n_pad = round_up(n_taps, TAPS_PAD)
+        rank, pixel = np.full((n, self.n_positions), -1), np.zeros((n, n_most))
+        start, weight = np.zeros((n, n_most, 2)), np.zeros((n, n_most, 2, n_pad), dtype)
+        first = np.zeros((n, self.n_rows * self.n_columns + 1))
+        for i, p in enumerate(points):
+            m = len(p.pixel)
+            rank[i, p.pixel], pixel[i, :m] = np.arange(m), p.pixel
+            start[i, :m], weight[i, :m, :, :n_taps] = p.start, p.weight
+            cells = np.arange(first.shape[1])
+            first[i] = np.searchsorted(p.start @ (self.n_columns, 1), cells)
+        line = 1 if self.by_run else tuning.line_group
+        shared = {"N_TAPS": n_taps, "N_PAD": n_pad, "RUN": RUN_PX, "ROWS": self.by_run}
+        self._to_pixels, self._to_plane = (
+            device.launcher("points.cl", name, dtype=dtype, local_size=(line, *ones), **shared)
+            for name, ones in (("plane_to_points", (1,)), ("points_to_plane", (1, 1)))
+        )
+        tables = {"start": device.put(start, np.int32), "weight": device.put(weight)}
+        for launch in (self._to_pixels, self._to_plane):
+            launch.bind(n_positions=self.n_positions, n_most=n_most, n_bands=executor.n_bands)
+            launch.bind(n_rows=self.n_rows, n_columns=self.n_columns, n_tables=n, **tables)
+        self._to_pixels.bind(rank=device.put(rank, np.int32))
+        self._to_plane.bind(pixel=device.put(pixel, np.int32), first=device.put(first, np.int32))
+
+    def to_pixels(self, plane: ImageBatch, y: ImageBatch, n, which):
+        """Queues the sums of n planes (I, J) to y (n, P); which: the executor's."""
+        p = self.n_positions
+        size = -(-p // RUN_PX) if self.by_run else self.whole_groups(p), n
+        self._to_pixels(size, which=which, plane=plane.buffer, y=y.buffer, y_offset=y.offset)
+
+    def to_plane(self, y: ImageBatch, plane: ImageBatch, n, which):
+        """Queues the transpose: y (n, P) to n planes (I, J)."""
+        size = 1 if self.by_run else self.whole_groups(self.n_columns), self.n_rows, n
+        self._to_plane(size, which=which, plane=plane.buffer, y=y.buffer, y_offset=y.offset)

@@ -3,7 +3,7 @@
     forward   Z = D o (Ty I1 Tx)           both axes to frequencies, then the transfer function
               aligned    I2 = Sy Z Sx
               affine     G = Sy twist(Z Sx),  I2 = gather(G) along each line
-              distorted  I2[p] = sum_x (Sy Z)[p, x] Sx[p, x]
+              distorted  G = Sy Z Sx,  I2 = gather(G) at each pixel
     adjoint   the same factors transposed, in reverse order
 
 If a band is the sum of T images of the model, one through each PSF of a basis, then Z = sum_t Z_t

@@ -1,4 +1,4 @@
-"""Sparse interpolation along straight lines through the model."""
+"""Sparse interpolation along straight lines through the model, and at any points of it."""
 
 from __future__ import annotations
 
@@ -106,6 +106,32 @@ class LineTaps:
     def weight_t(self) -> np.ndarray:
         """As start_t."""
         return self._back[1]
+
+
+@dataclass(frozen=True, eq=False)
+class PointTaps:
+    """Observed pixels anywhere on the model, from the rows and columns of a finer plane g.
+
+        out[pixel[q]] = sum_ts weight[q, 0, t] weight[q, 1, s] g[start[q, 0] + t, start[q, 1] + s]
+
+    pixel (Q,): those that the model covers, in the order of their first rows and columns
+    start (Q, 2): first of the rows, and of the columns, that are summed
+    weight (Q, 2, W) [1]: of rows, times the pixel's area, and of columns
+    """
+
+    pixel: np.ndarray
+    start: np.ndarray
+    weight: np.ndarray
+
+    @property
+    def n_taps(self) -> int:
+        """W."""
+        return self.weight.shape[2]
+
+    @property
+    def n_bytes(self) -> int:
+        """Host memory [bytes]."""
+        return self.pixel.nbytes + self.start.nbytes + self.weight.nbytes
 
 
 def transpose_taps(start, weight, covered, n_columns):

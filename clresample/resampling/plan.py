@@ -20,9 +20,9 @@ import numpy as np
 from ..sky.fourier import is_mirror_symmetric
 from ..sky.mapping import Mapping, PaddedMapping
 from ..sky.psf import PSF, crop_psf, cut_psf
-from .gridding import KaiserBessel, LineTaps
+from .gridding import KaiserBessel, LineTaps, PointTaps
 from .transfer import WRAP_MARGIN, Certificate, transfer_function, wrap_radius
-from .wave_tables import aligned_tables, distorted_tables, line_tables, uniform_wave_table
+from .wave_tables import aligned_tables, line_tables, point_tables, uniform_wave_table
 
 # [bytes] Largest tables of one operator. Frames of 7000 pixels a side reach it; they take minutes,
 # in tiles seconds. A WCS that is wrong by orders of magnitude would need far more.
@@ -65,12 +65,12 @@ class ResamplingPlan:
     n_bands, n_terms: C bands of the observation, each the sum of T images of the model, one
         through each PSF of a PSFBasis; T is 1 if the PSF is the same everywhere
     d_plus, d_minus (C * T, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights,
-        and the phases that shift the observed rows and columns (aligned) or lines (affine) to their
-        positions: their tables are symmetric about 0
+        and the phases that shift the observed rows and columns (aligned), lines (affine) or plane
+        (distorted) to their positions: their tables are symmetric about 0
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
-    out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
-        (P, 2Hx)
-    twist (Hy, J) complex, lines: affine only
+    out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (I, 2Hy),
+        (2Hx, J)
+    twist (Hy, J) complex, lines: affine only; points: distorted only
     windows: plans made by `window`, by its arguments
     """
 
@@ -90,6 +90,7 @@ class ResamplingPlan:
     out_x: np.ndarray
     twist: np.ndarray | None = None
     lines: LineTaps | None = None
+    points: PointTaps | None = None
     windows: dict = field(default_factory=dict)
 
     @property
@@ -108,8 +109,8 @@ class ResamplingPlan:
         """Host memory of the tables and the mapping [bytes]."""
         values = (value for part in (self, self.mapping) for value in vars(part).values())
         own = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-        lines = 0 if self.lines is None else self.lines.n_bytes
-        return own + lines + sum(plan.n_bytes for plan in self.windows.values())
+        own += sum(taps.n_bytes for taps in (self.lines, self.points) if taps is not None)
+        return own + sum(plan.n_bytes for plan in self.windows.values())
 
     def window(self, shape, reach_px, precision: Precision, size=None, pixel=1) -> ResamplingPlan:
         """The plan of a box of the model and the part of the observation that its light reaches.
@@ -152,8 +153,7 @@ class ResamplingPlan:
     def mirrored(self) -> dict[str, bool]:
         """True if halves of tables mirror each other, as they do if all pixels are on the model."""
         tables = {"in_y": self.in_y, "in_x": self.in_x}
-        if self.geometry != "distorted":
-            tables |= {"out_y": self.out_y.T, "out_x": self.out_x}
+        tables |= {"out_y": self.out_y.T, "out_x": self.out_x}
         return {name: is_mirror_symmetric(table) for name, table in tables.items()}
 
 
@@ -180,7 +180,7 @@ def make_resampling_plan(
     radius = wrap_radius(psf_out, mapping.matrix) if radius is None else radius
     extent = mapping.shape_in if extent is None else extent
     n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
-    _check_size(mapping, psf_out, n_fft, n_bands)
+    _check_size(mapping, psf_out, n_fft, n_bands, precision.window)
     nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
     n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
@@ -188,7 +188,7 @@ def make_resampling_plan(
     if mapping.geometry == "affine":
         tables, d, middle = line_tables(mapping, nu, d, center, precision.window)
     elif mapping.geometry == "distorted":
-        tables = distorted_tables(mapping, nu, center)
+        tables, d, middle = point_tables(mapping, nu, d, center, precision.window)
     d = d * (2 / (n_fft[0] * n_fft[1]))
     d[:, 0] *= 0.5
     d[:, :, h_x - 1] *= 0.5
@@ -227,14 +227,15 @@ def _moved(d_plus, d_minus, nu, way):
     return d_plus * (phase_y * phase_x), d_minus * (phase_y * phase_x.conj())
 
 
-def _check_size(mapping, psf_out, n_fft, n_bands):
+def _check_size(mapping, psf_out, n_fft, n_bands, window: KaiserBessel):
     """Raises ValueError if a plan would need more than MAX_BYTES."""
     k = [_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i]) for i in (0, 1)]
     n_bytes = 3 * 16 * n_bands * k[0] * 2 * k[1]  # D and both OTFs; then waves at the pixels
     n_bytes += 16 * sum(n * h for n, h in zip(mapping.shape_in, k, strict=True))
     n_out = mapping.shape_out
     if mapping.geometry == "distorted":
-        n_out = [n_out[0] * n_out[1]] * 2
+        n_bytes += 8 * (2 * window.n_taps + 3) * n_out[0] * n_out[1]
+        n_out = [2 * window.oversampling * h + window.n_taps for h in k]  # of the plane, at most
     n_bytes += 16 * sum(n * h for n, h in zip(n_out, k, strict=True))
     if n_bytes > MAX_BYTES:
         size = float(np.sqrt(abs(np.linalg.det(mapping.matrix))))

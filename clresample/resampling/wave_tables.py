@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..device.rounding import round_up
 from ..sky.fourier import cos_sin_columns, uniform_waves
 from ..sky.mapping import Mapping
-from .gridding import KaiserBessel, LineTaps
+from .gridding import KaiserBessel, LineTaps, PointTaps
+
+# Sums over taps are padded to a multiple of this on CPUs, whose vectors have four elements or more.
+TAPS_PAD = 4
 
 
 def wave_table(nu, x) -> np.ndarray:
@@ -35,14 +39,36 @@ def aligned_tables(mapping: Mapping, nu, axes, center):
     return {"out_y": tables[0], "out_x": tables[1].T}, middle
 
 
-def distorted_tables(mapping: Mapping, nu, center):
-    """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
-    scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    y, x = np.moveaxis(mapping.at(*np.indices(mapping.shape_out)), -1, 0)
-    return {
-        "out_y": wave_table(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
-        "out_x": wave_table(nu[1], x.ravel() - center[1]),
-    }
+def point_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
+    """Observed pixels as points of a finer plane, from which they are interpolated on both axes.
+
+    Rows and columns of the plane lie along the model's, about the middle of the covered pixels, and
+    window.oversampling times closer than Nyquist's spacing. Returns (tables, d, middle): d divided
+    by the window's transform, and the distance of that middle from the model's (2,) [model px].
+    """
+    covered = mapping.covered
+    x = mapping.at(*np.nonzero(covered)) - center
+    low, high = x.min(axis=0), x.max(axis=0)
+    nu_max = np.array([max(own[-1], np.finfo(float).tiny ** 0.5) for own in nu])
+    spacing = np.minimum(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
+    both = np.concatenate([-nu[1][:0:-1], nu[1]])
+    d = d / (window.transform(nu[0] * spacing[0])[:, None] * window.transform(both * spacing[1]))
+
+    u = (x - low) / spacing
+    start = np.floor(u).astype(int)
+    weight = window.taps(u - start)
+    if mapping.area is not None:
+        weight[:, 0] *= mapping.area[covered][:, None]
+    # kernels for CPUs read whole vectors of taps
+    side = np.ceil((high - low) / spacing).astype(int) + 1 + round_up(window.n_taps, TAPS_PAD)
+    order = np.lexsort(start.T[::-1])
+    first = low - (window.n_taps / 2 - 1) * spacing  # position of the plane's first row and column
+    reach = spacing * (side - 1) / 2
+    out_y, out_x = (
+        uniform_wave_table(*own) for own in zip(nu, -reach, spacing, side.tolist(), strict=True)
+    )
+    points = PointTaps(np.flatnonzero(covered)[order], start[order], weight[order])
+    return {"out_y": out_y, "out_x": out_x.T, "points": points}, d, first + reach
 
 
 def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):

@@ -44,7 +44,8 @@ def flops_of(plan):
     if plan.mapping.geometry == "affine":
         columns = plan.out_x.shape[1]
         return flops + ky * kx * columns + my * ky * columns + my * mx * len(plan.lines.weight[0])
-    return flops + my * mx * ky * (kx + 1)
+    (rows, columns), taps = (len(plan.out_y), plan.out_x.shape[1]), plan.points.n_taps
+    return flops + rows * ky * kx + rows * columns * kx + my * mx * taps * (taps + 1)
 
 
 @pytest.mark.parametrize("n_bands", [1, 3])
@@ -66,14 +67,16 @@ def test_tiles_take_what_they_are_said_to(device, as_asked, geometry, n_bands):
         used = device.in_use - before
         n, k, j = max(window.shape_in), len(plan.in_y), plan.out_x.shape[1]
         time, memory = sizes.account(geometry, m, n, k, j)
-        assert time == pytest.approx(2 * n_bands * flops_of(plan), rel=1e-9)
+        # a plane has as many rows as columns, or some more or fewer
+        rel = 1e-9 if geometry != "distorted" else 0.05
+        assert time == pytest.approx(2 * n_bands * flops_of(plan), rel=rel)
         if as_asked is None:  # guards of buffers count as memory
-            assert memory == pytest.approx(used, rel=2e-3)
+            assert memory == pytest.approx(used, rel=max(rel, 2e-3))
             assert 0.9 < op.n_bytes / used < 1.35
-        n_most, k_most, j_most = sizes.sides(m)
+        n_most, k_most, j_most = sizes.sides(geometry, m)
         assert n <= n_most <= n + 1
         assert k <= k_most <= 1.05 * k + 4
-        assert geometry != "affine" or j <= j_most <= 1.05 * j + 2
+        assert geometry == "aligned" or j <= j_most <= 1.05 * j + 4
         assert sizes.cost(geometry, m) == sizes.account(geometry, m, n_most, k_most, j_most)
         assert 1 <= sizes.cost(geometry, m)[0] / time < 1.17
         sizes.tuning = replace(tuning, tile_flops=1e9, pixel_flops=1e3)
@@ -111,16 +114,20 @@ def test_the_quickest_tile_within_the_memory_is_chosen():
 
 
 def test_the_bound_on_tables_counts_what_a_plan_holds(monkeypatch):
-    """To the byte where all frequencies stay: three times D and, but for lines, the waves."""
+    """To the byte where all frequencies stay: three times D and, but for lines, the waves.
+
+    Up to 1.3 times as much for distorted pixels, since some of them may lie off the model.
+    """
     precision, sample = Precision.of(np.float32), PSF([[1.0]])
-    for name in ("aligned", "distorted"):
+    for name, more in (("aligned", 1.0), ("distorted", 1.3)):
         mapping = GEOMETRIES[name]()
         for shape in ((31, 26), (43, 120)):
             mapping = replace(mapping, shape_in=shape)
             plan = plan_module.make_resampling_plan(mapping, sample, sample, precision=precision)
             held = sum(t.nbytes for t in (plan.in_y, plan.in_x, plan.out_y, plan.out_x))
             held += 3 * (plan.d_plus.nbytes + plan.d_minus.nbytes)
-            monkeypatch.setattr(plan_module, "MAX_BYTES", held)
+            held += 0 if plan.points is None else plan.points.n_bytes
+            monkeypatch.setattr(plan_module, "MAX_BYTES", int(more * held))
             plan_module.make_resampling_plan(mapping, sample, sample, precision=precision)
             monkeypatch.setattr(plan_module, "MAX_BYTES", held - 1)
             with pytest.raises(ValueError, match=r"needs tables of \S+ GiB"):

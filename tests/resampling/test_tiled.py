@@ -195,6 +195,7 @@ def test_strong_distortion_is_followed_pixel_by_pixel():
             tiled.covered[y0 : y0 + shape[0], x0 : x0 + shape[1]], part.covered
         )
         error = result[:, y0 : y0 + shape[0], x0 : x0 + shape[1]] - part(x)
+        error = error[:, group.tiles[0].mask]
         assert np.linalg.norm(error) < 5e-6 * np.linalg.norm(result)
 
 

@@ -18,7 +18,6 @@ class ExecutorTables(DeviceMemory):
     """
 
     n_rows: int
-    bounded = True  # True if products of an item end where the tables of its plan end
 
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
@@ -29,7 +28,7 @@ class ExecutorTables(DeviceMemory):
         self.k_y, self.k_x = 2 * self.h_y, 2 * self.h_x
         self.k_pad = row_stride(self.k_x)
         self.k_ys, self.k_xs = np.array([[self.k_y, self.k_x]] * len(plans)).T
-        if self.bounded and len(plans) > 1:
+        if len(plans) > 1:
             self.k_ys, self.k_xs = 2 * np.array([[len(nu) for nu in p.nu] for p in plans]).T
             self.which = device.put(np.arange(len(plans)), np.int32)
         self.in_y = self._table([p.in_y for p in plans], self.k_y, self.n_y)

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from ...device.contraction import row_stride
+from ...device.rounding import round_up
 from ...device.tuning import Tuning
 from ...sky.extent import grid_intersection
 from ...sky.grid import Grid
@@ -16,6 +17,7 @@ from ...sky.psf import PSF
 from ..affine import kept_taps
 from ..plan import Precision, make_resampling_plan
 from ..transfer import wrap_radius
+from ..wave_tables import TAPS_PAD
 
 GEOMETRIES = ("aligned", "affine", "distorted")  # from the cheapest on
 # [observed px] Side of the tile from which the band is measured. It finds the band's edge to one
@@ -127,6 +129,7 @@ class TileCosts:
         # the band's edge, to one frequency of the small plan
         n_frequencies = plan.certificate.n_frequencies
         self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
+        self.window = precision.window
         self.columns, self.taps, self.taps_back = 0.0, 0, 0
         if plan.lines is not None:
             self.taps, self.taps_back = plan.lines.weight.shape[1], plan.lines.weight_t.shape[1]
@@ -135,21 +138,24 @@ class TileCosts:
 
     def cost(self, geometry, m):
         """Time [flops] of a tile of m x m observed pixels, and its device memory [bytes]."""
-        return self.account(geometry, m, *self.sides(m))
+        return self.account(geometry, m, *self.sides(geometry, m))
 
-    def sides(self, m):
+    def sides(self, geometry, m):
         """Sides of a tile of m x m observed pixels: window pixels n, waves k, columns j.
 
         Upper limits: pixels of a side of its window, waves of an axis, columns crossed by its
-            lines.
+            lines or of its plane.
         """
         n = int(np.ceil(self.scale * (m - 1))) + self.border
         k = 2 * (int(self.band * (n + self.pad)) + 1)
+        if geometry == "distorted":
+            j = 2 * self.band * self.window.oversampling * self.scale * m
+            return n, k, int(j) + round_up(self.window.n_taps, TAPS_PAD) + 2
         return n, k, int(self.columns * self.scale * m) + self.taps + 1
 
     def account(self, geometry, m, n, k, j):
         """Terms of `cost`, from the sides of the executors' matrices."""
-        rows = m * m if geometry == "distorted" else m
+        rows = j if geometry == "distorted" else m
         wide, crossed = row_stride(k), row_stride(j)
         flops = n * n * k + n * k * k
         tables = 2 * n * k + k * row_stride(n) + n * wide + 2 * rows * k
@@ -165,8 +171,11 @@ class TileCosts:
             tables += m * m * (taps + 1) + m * crossed * (taps_back + 1)
             each_band += (k + m) * crossed
         else:
-            flops += rows * k * (k + 1)
-            tables += rows * wide
+            taps = self.window.n_taps
+            flops += j * k * k + j * j * k + m * m * taps * (taps + 1)
+            tables += k * crossed + j * wide
+            tables += m * m * (4 + 2 * round_up(taps, TAPS_PAD)) + j * j
+            each_band += j * j
         pixels = self.n_bands * (n * n + m * m)
         time = 2 * self.n_bands * flops
         time += self.tuning.tile_flops + self.tuning.pixel_flops * pixels
