@@ -24,7 +24,7 @@
 #ifndef ROWS        /* 1: a work-item takes many pixels, as a CPU's vector unit wants it */
 #define ROWS 0
 #endif
-#ifndef RUN
+#ifndef RUN         /* pixels of a work-item where ROWS are set */
 #define RUN 64
 #endif
 /* Four neighbouring elements, which begin anywhere. */

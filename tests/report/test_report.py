@@ -109,6 +109,7 @@ def test_pulls_and_completeness_are_those_of_the_truth(done, sky, tmp_path):
     for channel in ("VIS", "i"):
         flux, error = (rows[f"{n}_{channel}"].value for n in ("flux", "flux_err"))
         pulls = [(flux[k] - sky.truth[f"flux_{channel}"][t]) / error[k] for t, k in own.items()]
+        pulls = np.array(pulls)[np.isfinite(pulls)]  # sources beside Euclid's image have no VIS
         middle = np.median(pulls)
         width = 1.4826 * np.median(np.abs(pulls - middle))
         told = f"median {middle:.2f}, width {width:.2f}, n = {len(pulls)}".replace("-", "−")
