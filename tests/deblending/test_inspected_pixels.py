@@ -47,6 +47,14 @@ def test_correlated_noise_is_named_unless_it_is_declared(width, declared):
         assert ratio == pytest.approx(1 / noise.std(), rel=0.3)
 
 
+@pytest.mark.parametrize("brightness", [100, 300, 3000])
+def test_light_that_fills_the_image_is_not_taken_for_noise(brightness):
+    y, x = np.indices(SHAPE) - np.array(SHAPE)[:, None, None] / 2
+    light = brightness * NOISE * ((np.hypot(y, x) + 3) / 10) ** -2
+    messages = " ".join(inspected([observed(image_of() + light)]).messages)
+    assert messages and "noise of" not in messages and "weights say" not in messages
+
+
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_wrong_weights_are_named(factor):
     (message,) = inspected([observed(image_of(), weights=(factor * NOISE) ** -2)]).messages

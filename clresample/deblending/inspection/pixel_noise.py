@@ -42,8 +42,10 @@ def noise_lines(image, sky) -> list[str]:
     smooth = sky.blocks.sums(np.where(pixels, values, 0)) / counts
     local = values - sky.blocks.on_pixels(smooth, values.shape)
     for c in np.flatnonzero(many):
-        correlation[c] = _correlation(values[c], pixels[c])
         own = _scatter(local[c][pixels[c]])
+        if sky.block_scatter[c] > sky.blocks.side * max(own, 1):
+            continue  # light: means over blocks of noise, however alike its pixels, scatter less
+        correlation[c] = _correlation(values[c], pixels[c])
         # that of the blocks' means is of smooth noise, or of light that is brighter than the noise
         scatter[c] = max(own, min(np.hypot(own, sky.block_scatter[c] / sky.blocks.side), 1))
     lines = _uneven_lines(local, pixels, sky.blocks, o.channels)
