@@ -44,7 +44,7 @@ DEFINITIONS = definitions(
         "n_blend_sources": ("sources that were detected in the blend", None, np.int32),
         "detection_pass": ("1 = detected before the fit, 2 = in its residuals", None, np.int16),
         "detection_snr": "signal to noise of the detection, all instruments together",
-        "snr": "signal to noise of the fluxes of all channels",
+        "snr": "signal to noise of the positive fluxes of all channels",
         "y": ("row of the position in the model's pixels, from 0", u.pix),
         "x": ("column of the position in the model's pixels, from 0", u.pix),
         "ra": ("right ascension of the position", u.deg),

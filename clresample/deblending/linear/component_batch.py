@@ -22,7 +22,9 @@ EDGE_NOISE_FRACTION = 0.01
 # precision of float32, the second is used before the flux is known.
 FAINTEST, BRIGHTEST = 1e-6, 2e-3
 # [px] Sides of pixels on which profiles are drawn in boxes beyond the last of BOX_SIDES, the widest
-# beyond which no wave has more than a part UNRESOLVED of the light.
+# beyond which no wave has more than a part UNRESOLVED of the light. On wider ones light that the
+# frame cuts rings far into it, and nothing is gained: the start of r_e = 64 px takes 3.1 s on the
+# model's pixels, 0.4 s with 4 px, 0.5 s with 16.
 WIDE_PX, UNRESOLVED = (2, 4), 1e-4
 
 
