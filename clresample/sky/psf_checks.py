@@ -127,10 +127,13 @@ def psf_warnings(images, center, core='center="core"') -> list[str]:
     if cut.any():
         i = int(np.abs(light).argmax())
         n_y, n_x = images.shape[1:]
+        where = f"at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i}"
         messages.append(
-            f"PSF light cut at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i} "
-            f"about {100 * light[i]:.1f} % lies beyond; a larger image, or one without "
-            "background, is needed"
+            f"PSF light cut {where} about {100 * light[i]:.1f} % lies beyond; a larger image, or "
+            "one without background, is needed"
+            if light[i] > 0
+            else f"PSF negative {where} wings as faint would take {-100 * light[i]:.1f} % of the "
+            "light; too much background has been subtracted"
         )
     limit = limit_power(images)
     coarse = limit > LIMIT_TOLERANCE
