@@ -107,6 +107,11 @@ NUMBERS = KeyRule(
 SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool), {"type": "boolean"})
 
 
+def word_rule(text, words):
+    """KeyRule of one of some words; text: these, for messages."""
+    return KeyRule(text, lambda value: value in words, {"enum": list(words)})
+
+
 def _switch_or(*words):
     """The rule of a switch that may be one of some words too."""
     known = ["true", "false", *(f'"{word}"' for word in words)]
@@ -134,11 +139,7 @@ TABLES = {
     },
     "frame": {
         "reference": TEXT,
-        "footprint": KeyRule(
-            '"union" or "intersection"',
-            lambda value: value in ("union", "intersection"),
-            {"enum": ["union", "intersection"]},
-        ),
+        "footprint": word_rule('"union" or "intersection"', ("union", "intersection")),
         "psf_sigma_px": POSITIVE,
     },
     "fit": {

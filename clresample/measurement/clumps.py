@@ -291,8 +291,10 @@ def _divided(image, outline, centers, level, point, chance, bright, peaks, first
         base = bases[(places == center).all(axis=1)].max(initial=0.0)
         group = int(heights.argmax()) if heights[i] < (1 + CLUMP) * base else i
         own = mask & (nearest == i)
-        rough = max(SMOOTHEST, _roughness(image[where], own, center - corner, level)) / ROUGH
-        clump = CLUMP * min(1.0, rough**2, 1 / (chance * mask.sum())) if bright else 0.0
+        clump = 0.0
+        if bright:
+            rough = max(SMOOTHEST, _roughness(image[where], own, center - corner, level)) / ROUGH
+            clump = CLUMP * min(1.0, rough**2, 1 / (chance * mask.sum()))
         light = float(image[where][own].sum()) / point
         found.append(Body(center, level, light, (where, own), clump, first + group))
     return found

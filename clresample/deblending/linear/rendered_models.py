@@ -115,8 +115,7 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
     others = [[b or v for b, v in zip(m.unfiltered_views, m.views, strict=True)] for m in models]
     if any(b is not None for m in models for b in m.unfiltered_views):
         bare = _taken(_rendered(models, others, False))
-    model = np.einsum("kcij,kcj->kci", looking.normal, looking.solution())
-    found, left = [], looking.right - model
+    found = []
     for b in range(len(models)):
         spectra = looking.spectra[looking.scene == b]
         found.append(
@@ -126,7 +125,7 @@ def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[Rende
                 looking.covariance(b),
                 tuple(observed[b]),
                 tuple(bare[b]),
-                np.where(spectra == 0, left[b, :, : len(spectra)].T, 0),
+                np.where(spectra == 0, _slopes(looking, b, spectra, looking.sky[b]), 0),
                 *_products(looking, b, models[b]),
             )
         )
@@ -176,10 +175,16 @@ def _products(looking, b, model):
     """See RenderedModel.power, slope."""
     if model.spectra is None:
         return None, None
-    n, normal, known = len(model.morphs), looking.normal[b], np.zeros_like(looking.right[b])
-    known[:, :n], known[:, -1] = model.spectra.T, model.sky
-    left = looking.right[b] - np.einsum("cij,cj->ci", normal, known)
-    return np.einsum("cii->ic", normal)[:n].copy(), left[:, :n].T
+    power = np.einsum("cii->ic", looking.normal[b])[: len(model.morphs)].copy()
+    return power, _slopes(looking, b, model.spectra, model.sky)
+
+
+def _slopes(looking, b, spectra, sky):
+    """Products (n, C) of whitened images with what spectra (n, C), sky (C,) leave of the data."""
+    n, known = len(spectra), np.zeros_like(looking.right[b])
+    known[:, :n], known[:, -1] = spectra.T, sky
+    left = looking.right[b] - np.einsum("cij,cj->ci", looking.normal[b], known)
+    return left[:, :n].T
 
 
 def _taken(looking):

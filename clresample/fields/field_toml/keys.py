@@ -30,6 +30,7 @@ from ...files.scene_keys import (
     one_or_many,
     one_or_many_schema,
     read_tables,
+    word_rule,
 )
 from ..area import AREAS
 from ..plugins import Formats
@@ -130,10 +131,8 @@ IMAGE: dict[str, KeyRule | OneOf] = {
         one_or_many_schema(ABOVE_ZERO),
     ),
     "zero_point": NUMBERS,
-    "background": KeyRule(
-        '"subtract", or "none" where it is subtracted already',
-        lambda value: value in ("subtract", "none"),
-        {"enum": ["subtract", "none"]},
+    "background": word_rule(
+        '"subtract", or "none" where it is subtracted already', ("subtract", "none")
     ),
     "noise": KeyRule(
         '"estimate", "white", or the name of a file with the autocorrelation of the noise',
@@ -149,22 +148,14 @@ SURVEY: dict[str, KeyRule | OneOf] = {  # the same of a survey's files
     ),
     "bands": KeyRule("a list of the format's bands", one_or_many(is_text), TEXTS),
     **{key: IMAGE[key] for key in (*SHARED, *(key for key in IMAGE if key.startswith("psf")))},
-    "noise": KeyRule(
-        '"estimate", or "white"',
-        lambda value: value in ("estimate", "white"),
-        {"enum": ["estimate", "white"]},
-    ),
+    "noise": word_rule('"estimate", or "white"', ("estimate", "white")),
 }
 SCENE_TABLES = {"observation": IMAGE} | TABLES
 FIELD_TABLES = {
     "mosaic": IMAGE,
     "field": {
         "field_number": COUNT,
-        "area": KeyRule(
-            " or ".join(f'"{area}"' for area in AREAS),
-            lambda value: value in AREAS,
-            {"enum": list(AREAS)},
-        ),
+        "area": word_rule(" or ".join(f'"{area}"' for area in AREAS), AREAS),
         "tile_px": COUNT,
         "overlap_px": COUNT,
         "margin_px": COUNT,
