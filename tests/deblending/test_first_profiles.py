@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers.scenes import blend
 
-from clresample import Settings
+from bench.harness.ladder_cases import Limits, scene_of
+from clresample import Blend, Settings
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.start import first_profiles as first_profiles_module, profile_fit
 from clresample.deblending.start.first_profiles import GROWTH, first_profiles
@@ -61,6 +62,22 @@ def test_of_two_giants_each_has_its_size(sized):
     sizes = np.log([GIANT[2], other[2]])
     assert abs(first[0] - sizes[0]) < 0.3
     np.testing.assert_allclose(found[[0, 2]], sizes, atol=0.1)
+
+
+def test_a_first_profile_takes_no_neighbours_light_into_its_wings(device, monkeypatch):
+    """The first of two equals is fitted without the other, whose light wide wings would explain."""
+    wings = []
+
+    def noted(fit, scenes, error):
+        large = first_profiles(fit, scenes, error)
+        wings.extend(theta[3] for theta in fit.thetas())
+        return large
+
+    monkeypatch.setattr(profile_fit, "first_profiles", noted)
+    scene = scene_of("pair", "one", 41901, 14, Limits(largest_re_px=20))
+    pair = Blend(scene.observations, scene.sources)
+    start_fits([Fit(pair, Settings(), device, np.float32, pad=1)])
+    assert min(wings) >= np.log(0.1)  # n = 4
 
 
 def test_small_galaxies_are_started_once(sized):

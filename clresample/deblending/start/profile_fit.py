@@ -6,7 +6,7 @@ from copy import deepcopy
 
 import numpy as np
 
-from ..linear.component_batch import peaks_of, renumbered
+from ..linear.component_batch import peaks_of
 from ..linear.equations import N_PARAMETERS, normal_equations
 from ..linear.linearised_scenes import LinearisedScenes
 from ..linear.spectra import MODEL_ERROR, add_diagonal
@@ -22,9 +22,6 @@ N_STEPS, CHI2_TOL = 40, 1.0
 # were too long, and shorter ones follow, 8 trials more in 206 of 24 scenes (bench.throughput). A
 # pair ended 18 in chi2 early, and moved by 0.3 sigma with a faint source far away.
 MAX_SHORTFALL = 2.0
-# Largest number of steps after each large profile that is added, before all are fitted together:
-# these end where they gain less than NEED, as smaller differences do not choose profiles.
-N_FIRST_STEPS = 5
 # A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
 # per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
 # beyond 0.74 and 1.06, but six of real COSMOS galaxies are, of which one has a second start. Second
@@ -48,6 +45,7 @@ class ProfileFit:
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
+    least_ln_beta: smallest ln beta that steps reach
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
         is common to all channels, and that of each band, see shape_grid.py; 0 for others
@@ -71,7 +69,7 @@ class ProfileFit:
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
-        self.moves = np.ones(size[:2], bool)
+        self.moves, self.least_ln_beta = np.ones(size[:2], bool), -np.inf
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -124,22 +122,6 @@ class ProfileFit:
         part.population.scatter[part.at] = self.population.scatter[here]
         return part
 
-    def fit_part(self, thetas, free, scenes):
-        """Fits profiles of some components without the others; their parameters, as `thetas`.
-
-        thetas: {component: parameters (n,)}; free: set of those that move; scenes (k,): that are
-            fitted, others stay as they are
-        """
-        here = [i for i in thetas if self.looking.scene[i] in scenes]
-        part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
-        fit = self.part(part, here, self.noise)
-        for b, k, i in zip(*fit.at, here, strict=True):
-            fit.theta[b, k, : len(thetas[i])] = thetas[i]
-            fit.moves[b, k] = i in free
-        fit._take(scenes)
-        fit._step(scenes, N_FIRST_STEPS, NEED)
-        return thetas | dict(zip(here, fit.thetas(), strict=True))
-
     def _take(self, scenes, *, doubt=True):
         """Solves some scenes and stores a step's inputs; doubt: contaminate shapes anew."""
         if len(scenes):
@@ -166,6 +148,7 @@ class ProfileFit:
             scenes = np.flatnonzero(live)
             given = *self._equations(scenes), self.population.galaxies[scenes], self.moves[scenes]
             trial, expected, promised = steps.next(scenes, *given)
+            trial[..., 3] = np.maximum(trial[..., 3], self.least_ln_beta)
             on = expected >= tol
             live[scenes[~on]] = False
             scenes = scenes[on]
