@@ -12,9 +12,11 @@ from helpers.inspection import (
     looked_at,
     observed,
     sources_of,
+    with_photon_noise,
 )
 
 from clresample.deblending.inspection import disagreement, levels, listing, shifted
+from clresample.deblending.inspection.centroids import centroids
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import (
@@ -189,6 +191,27 @@ def test_stars_of_another_width_than_the_psf_are_named(factor, word):
     near = PointSource(position_px=(DRAWN[0][0][0] + 10, DRAWN[0][0][1]))
     beside = (*sources_of(star, PointSource), near)
     assert not any(word in m for m in inspected([o], beside).messages)
+
+
+@pytest.mark.parametrize("factor, word", [(1.0, ""), (1.2, "narrower"), (0.8, "wider")])
+@pytest.mark.parametrize("flux", [2e4, 1e6])
+def test_photon_noise_in_the_variance_is_no_width(factor, word, flux):
+    star = ((DRAWN[0][0], (flux, flux), 0.0),)
+    o = with_photon_noise(star, psf_sigma=factor * FWHM_SIGMA)
+    messages = inspected([o], sources_of(star, PointSource)).messages
+    assert [f"a source is {word} than the PSF" in m for m in messages] == [True] * (factor != 1)
+
+
+def test_photon_noise_in_the_variance_moves_no_centroid_and_hides_no_light():
+    place, faint = np.array(DRAWN[0][0]), (3e4, 3e4)
+    stars = (place, (1e5, 1e5), 0.0), (place + (0, 9.5), faint, 0.0)
+    listed = (ExtendedSource(position_px=place - (0, 1.0)),)
+    images = [looked_at(o, listed) for o in (observed(image_of(stars)), with_photon_noise(stars))]
+    uniform, photons = (centroids(image).offsets for image in images)
+    np.testing.assert_allclose(photons, uniform, atol=0.03)
+    for image in images:
+        ((_, y, x),) = listing.unlisted(image)
+        assert (y, x) == (20, 28)
 
 
 def test_channels_that_lie_apart_are_named():

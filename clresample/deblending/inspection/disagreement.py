@@ -54,10 +54,8 @@ class ImagePlane:
     @classmethod
     def of(cls, image, c) -> ImagePlane:
         """Channel c of an InspectedImage."""
-        usable = image.usable[c]
-        data = np.where(usable, image.observation.data[c] - image.level[c], 0) / image.sigma[c]
         psf = image.observation.psf[c]
-        return cls(data.astype(np.float32), usable, psf, image.matrix, image.offset)
+        return cls(image.brightness[c], image.usable[c], psf, image.matrix, image.offset)
 
 
 def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, np.ndarray]:

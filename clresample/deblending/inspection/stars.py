@@ -57,7 +57,7 @@ def _width(image, i):
 
         d = b + a P(x - p) - a t . grad P + a part dP/dpart,   P wider by part: P(x / (1 + part))
 
-    by least squares; 0 and infinity where it cannot be measured.
+    by least squares with the weights of the pixels; 0 and infinity where it cannot be measured.
     """
     reach = int(np.ceil(REACH_FWHM * image.width_px)) + 1
     y, x, on = image.patches(np.array([i]), reach)
@@ -78,6 +78,7 @@ def _width(image, i):
     columns = (np.ones_like(here), here, (up - down) / (2 * s), (right - left) / (2 * s), slope)
     design = np.stack([column.ravel() for column in columns])
     design[1:] /= here.max()
+    design *= np.sqrt(image.observation.weights[c, y, x]).ravel() * image.sigma[c]
     z = light[c].ravel().astype(float)
     inverse = np.linalg.pinv(design @ design.T)
     found = inverse @ (design @ z)
