@@ -1,5 +1,7 @@
 """Problems of observations are reported before a fit, and mended where that is safe."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers.inspection import (
@@ -202,6 +204,16 @@ def test_photon_noise_in_the_variance_is_no_width(factor, word, flux):
     assert [f"a source is {word} than the PSF" in m for m in messages] == [True] * (factor != 1)
 
 
+@pytest.mark.parametrize("sigma, off", [(1.0, 1.0), (1.0, 0.7), (3.0, 2.0)])
+def test_a_star_away_from_its_place_is_no_wider(sigma, off):
+    (y, x), flux = DRAWN[0][0], (1e5, 1e5)
+    o = observed(
+        image_of((((y + off, x), flux, 0.0),), sigma=sigma), sigma=np.hypot(sigma, 12**-0.5)
+    )
+    messages = inspected([o], (PointSource(position_px=(y, x)),)).messages
+    assert not any("wider" in m or "narrower" in m for m in messages)
+
+
 def test_photon_noise_in_the_variance_moves_no_centroid_and_hides_no_light():
     place, faint = np.array(DRAWN[0][0]), (3e4, 3e4)
     stars = (place, (1e5, 1e5), 0.0), (place + (0, 9.5), faint, 0.0)
@@ -235,6 +247,23 @@ def test_observations_that_disagree_are_moved(shift):
     said = inspected(both, fit_shifts=False)
     assert said.settings.fit_shifts is False and not said.shifts.any()
     assert len(said.messages) == any(shift)
+
+
+@pytest.mark.parametrize("odd, others, n_dark", [(0, 2, 0), (0, 3, 1), (2, 3, 0), (1, 1, 0)])
+def test_of_several_observations_the_one_that_disagrees_is_named(odd, others, n_dark):
+    """The sharpest is the first; one without light is neither."""
+    there = tuple(((y + 0.5, x), f, s) for (y, x), f, s in DRAWN)
+    all_of = []
+    for i in range(others + 1):
+        sigma, drawn = (1.5 if i == 0 else 1.8), there if i == odd else DRAWN
+        drawn = () if i > others - n_dark else drawn
+        data = image_of(drawn, seed=i, sigma=sigma)
+        all_of.append(observed(data, sigma=sigma, name=f"E{i}", channels=(f"g{i}", f"r{i}")))
+    found = inspected(all_of)
+    (message,) = (m for m in found.messages if "lies away from that" in m)
+    assert message.startswith(f"light in E{odd} ") and re.search(r"by \(\+0\.[456]", message)
+    moved = [-0.5 * (i == odd) for i in range(others + 1)]
+    np.testing.assert_allclose(found.shifts[:, 0], np.subtract(moved, moved[0]), atol=0.15)
 
 
 @pytest.mark.parametrize("shift, n_channels", [((0.0, 0.0), 1), ((0.5, -0.4), 2)])
