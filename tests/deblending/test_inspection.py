@@ -214,6 +214,16 @@ def test_a_star_away_from_its_place_is_no_wider(sigma, off):
     assert not any("wider" in m or "narrower" in m for m in messages)
 
 
+@pytest.mark.parametrize("place, is_named", [((20, 24), True), ((22, 20), False)])
+def test_masked_pixels_beside_a_stars_core_hide_no_width(place, is_named):
+    star = (((20.2, 18.7), (1e5, 1e5), 0.0),)
+    weights = np.full((2, *SHAPE), NOISE**-2)
+    weights[:, *place] = 0
+    o = observed(image_of(star), sigma=0.8 * FWHM_SIGMA, weights=weights)
+    messages = inspected([o], sources_of(star, PointSource)).messages
+    assert any("wider than the PSF" in m for m in messages) == is_named
+
+
 def test_photon_noise_in_the_variance_moves_no_centroid_and_hides_no_light():
     place, faint = np.array(DRAWN[0][0]), (3e4, 3e4)
     stars = (place, (1e5, 1e5), 0.0), (place + (0, 9.5), faint, 0.0)
@@ -264,6 +274,24 @@ def test_of_several_observations_the_one_that_disagrees_is_named(odd, others, n_
     assert message.startswith(f"light in E{odd} ") and re.search(r"by \(\+0\.[456]", message)
     moved = [-0.5 * (i == odd) for i in range(others + 1)]
     np.testing.assert_allclose(found.shifts[:, 0], np.subtract(moved, moved[0]), atol=0.15)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+@pytest.mark.parametrize("odd, factor", [(0, 1.1), (1, 0.9), (1, 1.0)])
+def test_an_exposure_with_other_counts_than_its_band_is_named(n, odd, factor):
+    """Of several seeings and zero points; of two exposures the sharper one is right."""
+    exposures = []
+    for i in range(n):
+        sigma, points = 1.2 + 0.3 * ((i + 1) % 4), np.array([25, 25.5]) + 0.3 * i
+        scale = 10 ** (0.4 * (points - 25)) * (factor if i == odd else 1)
+        drawn = tuple((place, scale * flux, size) for place, flux, size in DRAWN)
+        given = {"channels": (f"g{i}", f"r{i}"), "bands": ("g", "r"), "zero_points": points}
+        image = image_of(drawn, seed=i, sigma=sigma, noise=0.5)
+        exposures.append(observed(image, sigma=sigma, name=f"E{i}", weights=4.0, **given))
+    messages = [m for m in inspected(exposures).messages if "counts in channel" in m]
+    assert len(messages) == 2 * (factor != 1)
+    if n > 2:
+        assert all(m.startswith(f"E{odd}: ") and f" {factor:.1f}" in m for m in messages)
 
 
 @pytest.mark.parametrize("shift, n_channels", [((0.0, 0.0), 1), ((0.5, -0.4), 2)])

@@ -75,6 +75,10 @@ class InspectedImage:
         """The same InspectedImage with the level (C,) [counts] of its sky known."""
         return replace(self, level=level)
 
+    def moved(self, shift) -> InspectedImage:
+        """The same InspectedImage of the observation moved by a further shift (2,) [model px]."""
+        return replace(self, offset=self.offset - self.matrix @ shift)
+
     def without(self, pixels) -> InspectedImage:
         """The same InspectedImage of the observation with the pixels (C, My, Mx) masked."""
         observation, usable = masked(self.observation, pixels), self.usable & ~pixels

@@ -16,6 +16,8 @@ WIDTH_PART = 0.05
 WIDTH_SIGMAS = 5.0
 # [FWHM] Half-width of the pixels compared; nearer neighbours widen a star.
 REACH_FWHM, NEIGHBOUR_FWHM = 1.5, 4.0
+# [1] Smallest part of them that is usable; all are within a FWHM of the star.
+MIN_USABLE = 0.75
 # Stars measured in an image at most.
 MAX_STARS = 3
 # [1], [px] Steps of the slopes by width and by position: small against the PSF's core.
@@ -68,10 +70,12 @@ def _width(image, i):
     light = image.significance[:, y, x]
     c = int(light.sum(axis=(1, 2)).argmax())
     good = on & image.usable[c, y, x]
-    if not good.all():
+    place = image.places[i]
+    core = np.hypot(y - place[0], x - place[1]) <= image.width_px
+    if not good[core].all() or good.mean() < MIN_USABLE:
         return c, 0.0, np.inf
-    root = np.sqrt(image.observation.weights[c, y, x]).ravel() * image.sigma[c]
-    z, place = light[c].ravel().astype(float), image.places[i]
+    root = np.where(good, np.sqrt(image.observation.weights[c, y, x]), 0).ravel() * image.sigma[c]
+    z = np.where(good, light[c], 0).ravel().astype(float)
     for _ in range(MAX_ROUNDS):
         away = y[:, 0] - place[0], x[0] - place[1]
         design = _columns(image.observation.psf, c, *away) * root
@@ -82,7 +86,7 @@ def _width(image, i):
         shift = -found[2:4] / found[1]
         if np.abs(shift).max() < SHIFT_STEP:
             rest = z - found @ design
-            spread = max(1.0, float(rest @ rest) / (rest.size - len(found)))
+            spread = max(1.0, float(rest @ rest) / (good.sum() - len(found)))
             part = found[4] / found[1]
             return c, float(part), float(np.sqrt(inverse[4, 4] * spread) / found[1])
         place = place + np.clip(shift, -MAX_MOVE_PX, MAX_MOVE_PX)
