@@ -28,6 +28,7 @@ from scipy.ndimage import (
     median_filter,
 )
 
+from ..deblending.inspection.image import brightness, typical_sigma
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
 from ..deblending.inspection.star_profile import RadialProfile
@@ -77,9 +78,9 @@ def saturated_stars(observations, frame) -> list[StarPlace]:
     found = []
     for o in observations:
         usable = o.weights > 0
-        light = np.where(usable, o.data * np.sqrt(o.weights), 0).astype(np.float32)
-        usable = usable & ~saturated_pixels(o, light, usable)
-        light[~usable] = 0
+        significance = np.where(usable, o.data * np.sqrt(o.weights), 0)
+        usable = usable & ~saturated_pixels(o, significance, usable)
+        light = brightness(o.data, usable, typical_sigma(o.weights))
         scale = o.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
         for c, fwhm in enumerate(o.psf.fwhm_px):
             for core in star_cores(light[c], usable[c], o.psf, c):

@@ -12,6 +12,7 @@ from helpers.inspection import (
     looked_at,
     observed,
     sources_of,
+    with_photon_noise,
 )
 
 from clresample.deblending.inspection import levels, spoilt
@@ -90,6 +91,17 @@ def test_cosmic_rays_are_masked(at):
     assert (weights[1, at[0] : at[0] + 2, at[1] : at[1] + 3] == 0).all()
     assert (weights == 0).sum() < 40 and (weights[0] > 0).all()
     assert (o.weights > 0).all()  # the user's own stays
+
+
+@pytest.mark.parametrize("beside, sigmas", [(0, 18), (2, 20), (3, 15)])
+def test_rays_on_light_are_found_above_its_photon_noise(beside, sigmas):
+    star, at = (((33.2, 30.3), (1e5, 1e5), 0.0),), (0, 33, 30 + beside)
+    o = with_photon_noise(star)
+    assert not spoilt.sharper_than_psf(looked_at(o, sources_of(star))).any()
+    data = o.data.copy()
+    data[at] += sigmas * o.weights[at] ** -0.5
+    image = looked_at(observed(data, weights=o.weights), sources_of(star))
+    assert np.argwhere(spoilt.sharper_than_psf(image)).tolist() == [[*at]]
 
 
 @pytest.mark.parametrize("given_sigma", [FWHM_SIGMA, 1.3 * FWHM_SIGMA])

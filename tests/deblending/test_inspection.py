@@ -1,5 +1,7 @@
 """Problems of observations are reported before a fit, and mended where that is safe."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers.inspection import (
@@ -12,9 +14,11 @@ from helpers.inspection import (
     looked_at,
     observed,
     sources_of,
+    with_photon_noise,
 )
 
 from clresample.deblending.inspection import disagreement, levels, listing, shifted
+from clresample.deblending.inspection.centroids import centroids
 from clresample.deblending.inspection.disagreement import shifts_at
 from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import (
@@ -191,6 +195,47 @@ def test_stars_of_another_width_than_the_psf_are_named(factor, word):
     assert not any(word in m for m in inspected([o], beside).messages)
 
 
+@pytest.mark.parametrize("factor, word", [(1.0, ""), (1.2, "narrower"), (0.8, "wider")])
+@pytest.mark.parametrize("flux", [2e4, 1e6])
+def test_photon_noise_in_the_variance_is_no_width(factor, word, flux):
+    star = ((DRAWN[0][0], (flux, flux), 0.0),)
+    o = with_photon_noise(star, psf_sigma=factor * FWHM_SIGMA)
+    messages = inspected([o], sources_of(star, PointSource)).messages
+    assert [f"a source is {word} than the PSF" in m for m in messages] == [True] * (factor != 1)
+
+
+@pytest.mark.parametrize("sigma, off", [(1.0, 1.0), (1.0, 0.7), (3.0, 2.0)])
+def test_a_star_away_from_its_place_is_no_wider(sigma, off):
+    (y, x), flux = DRAWN[0][0], (1e5, 1e5)
+    o = observed(
+        image_of((((y + off, x), flux, 0.0),), sigma=sigma), sigma=np.hypot(sigma, 12**-0.5)
+    )
+    messages = inspected([o], (PointSource(position_px=(y, x)),)).messages
+    assert not any("wider" in m or "narrower" in m for m in messages)
+
+
+@pytest.mark.parametrize("place, is_named", [((20, 24), True), ((22, 20), False)])
+def test_masked_pixels_beside_a_stars_core_hide_no_width(place, is_named):
+    star = (((20.2, 18.7), (1e5, 1e5), 0.0),)
+    weights = np.full((2, *SHAPE), NOISE**-2)
+    weights[:, *place] = 0
+    o = observed(image_of(star), sigma=0.8 * FWHM_SIGMA, weights=weights)
+    messages = inspected([o], sources_of(star, PointSource)).messages
+    assert any("wider than the PSF" in m for m in messages) == is_named
+
+
+def test_photon_noise_in_the_variance_moves_no_centroid_and_hides_no_light():
+    place, faint = np.array(DRAWN[0][0]), (3e4, 3e4)
+    stars = (place, (1e5, 1e5), 0.0), (place + (0, 9.5), faint, 0.0)
+    listed = (ExtendedSource(position_px=place - (0, 1.0)),)
+    images = [looked_at(o, listed) for o in (observed(image_of(stars)), with_photon_noise(stars))]
+    uniform, photons = (centroids(image).offsets for image in images)
+    np.testing.assert_allclose(photons, uniform, atol=0.03)
+    for image in images:
+        ((_, y, x),) = listing.unlisted(image)
+        assert (y, x) == (20, 28)
+
+
 def test_channels_that_lie_apart_are_named():
     data = image_of()
     data[1] = image_of(tuple(((y + 0.4, x), f, s) for (y, x), f, s in DRAWN))[1]
@@ -212,6 +257,41 @@ def test_observations_that_disagree_are_moved(shift):
     said = inspected(both, fit_shifts=False)
     assert said.settings.fit_shifts is False and not said.shifts.any()
     assert len(said.messages) == any(shift)
+
+
+@pytest.mark.parametrize("odd, others, n_dark", [(0, 2, 0), (0, 3, 1), (2, 3, 0), (1, 1, 0)])
+def test_of_several_observations_the_one_that_disagrees_is_named(odd, others, n_dark):
+    """The sharpest is the first; one without light is neither."""
+    there = tuple(((y + 0.5, x), f, s) for (y, x), f, s in DRAWN)
+    all_of = []
+    for i in range(others + 1):
+        sigma, drawn = (1.5 if i == 0 else 1.8), there if i == odd else DRAWN
+        drawn = () if i > others - n_dark else drawn
+        data = image_of(drawn, seed=i, sigma=sigma)
+        all_of.append(observed(data, sigma=sigma, name=f"E{i}", channels=(f"g{i}", f"r{i}")))
+    found = inspected(all_of)
+    (message,) = (m for m in found.messages if "lies away from that" in m)
+    assert message.startswith(f"light in E{odd} ") and re.search(r"by \(\+0\.[456]", message)
+    moved = [-0.5 * (i == odd) for i in range(others + 1)]
+    np.testing.assert_allclose(found.shifts[:, 0], np.subtract(moved, moved[0]), atol=0.15)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+@pytest.mark.parametrize("odd, factor", [(0, 1.1), (1, 0.9), (1, 1.0)])
+def test_an_exposure_with_other_counts_than_its_band_is_named(n, odd, factor):
+    """Of several seeings and zero points; of two exposures the sharper one is right."""
+    exposures = []
+    for i in range(n):
+        sigma, points = 1.2 + 0.3 * ((i + 1) % 4), np.array([25, 25.5]) + 0.3 * i
+        scale = 10 ** (0.4 * (points - 25)) * (factor if i == odd else 1)
+        drawn = tuple((place, scale * flux, size) for place, flux, size in DRAWN)
+        given = {"channels": (f"g{i}", f"r{i}"), "bands": ("g", "r"), "zero_points": points}
+        image = image_of(drawn, seed=i, sigma=sigma, noise=0.5)
+        exposures.append(observed(image, sigma=sigma, name=f"E{i}", weights=4.0, **given))
+    messages = [m for m in inspected(exposures).messages if "counts in channel" in m]
+    assert len(messages) == 2 * (factor != 1)
+    if n > 2:
+        assert all(m.startswith(f"E{odd}: ") and f" {factor:.1f}" in m for m in messages)
 
 
 @pytest.mark.parametrize("shift, n_channels", [((0.0, 0.0), 1), ((0.5, -0.4), 2)])

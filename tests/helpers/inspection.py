@@ -37,6 +37,14 @@ def observed(data, *, sigma=FWHM_SIGMA, name="cam", channels=("g", "r"), **given
     return Observation(data, PSF.gaussian(sigma), grid, name=name, channels=channels, **given)
 
 
+def with_photon_noise(drawn, *, gain=0.5, seed=0, psf_sigma=FWHM_SIGMA):
+    """An Observation whose noise and variance have that of the sources' light."""
+    light = image_of(drawn, noise=0.0)
+    variance = NOISE**2 + light / gain
+    data = light + np.random.default_rng(seed).normal(size=light.shape) * variance**0.5
+    return observed(data, sigma=psf_sigma, weights=1 / variance)
+
+
 def sources_of(drawn=DRAWN, kind=ExtendedSource):
     return tuple(kind(position_px=place) for place, _, _ in drawn)
 

@@ -94,6 +94,19 @@ def test_a_masked_core_is_found_by_the_light_around_it():
     assert core.masked[44, 47] and core.masked[:, 47].sum() > 20  # with its bleeds
 
 
+@pytest.mark.parametrize("gain", [np.inf, 1.0, 0.1])
+@pytest.mark.parametrize("flux", [2e6, 2e8])
+def test_photon_noise_in_the_variance_hides_no_core(gain, flux):
+    y, x = np.indices(SHAPE)
+    light = flux * moffat(y - STAR[0], x - STAR[1])
+    weights = np.where(light < LEVEL, 1 / (NOISE**2 + light / gain), 0)
+    sides = np.arange(-25.0, 26.0)
+    psf, grid = PSF(moffat(sides[:, None], sides)), Grid.flat(SHAPE, 0.26)
+    o = Observation(light, psf, grid, weights=weights, channels=("r",))
+    (star,) = saturated_stars([o], model_frame([o]))
+    assert np.hypot(*(star.place - STAR)) < 0.2
+
+
 @pytest.mark.parametrize("bright_px, grown_px", [(9.0, 3), (4.0, 1), (2.0, 0)])
 def test_a_core_grows_while_its_star_is_bright_beside_it(bright_px, grown_px):
     y, x = np.indices((31, 31)) - 15

@@ -38,7 +38,7 @@ def centroids(image: InspectedImage) -> Centroids:
 
         m1 = sum w z r / sum w z,    m2 = sum w z r^2 / (2 sum w z),    offset = m1 / (1 - m2 / s^2)
 
-    z: significance; r: from the place; w: Gaussian of standard deviation s, that of the PSF. The
+    z: brightness; r: from the place; w: Gaussian of standard deviation s, that of the PSF. The
     offset is exact for Gaussian light of any width.
     """
     chosen = image.brightest
@@ -46,7 +46,9 @@ def centroids(image: InspectedImage) -> Centroids:
     reach = int(np.ceil(REACH * width.max()))
     y, x, on = image.patches(chosen, reach)
     usable = image.usable[:, y, x] & on
-    light = np.where(usable, image.significance[:, y, x], 0)  # (C, n, h, h)
+    light, variance = (
+        np.where(usable, v[:, y, x], 0) for v in (image.brightness, image.variance)
+    )  # (C, n, h, h)
     away = np.stack([y[:, :, 0], x[:, 0]]) - image.places[chosen].T[..., None]  # (2, n, h)
     core = away[0, :, :, None] ** 2 + away[1, :, None] ** 2 <= (width.max() * 1.5) ** 2
     whole = (usable | ~core).all(axis=(2, 3))  # (C, n)
@@ -54,8 +56,9 @@ def centroids(image: InspectedImage) -> Centroids:
     weight = np.exp(-0.5 * (away[:, None] / width[:, None, None]) ** 2)  # (2, C, n, h)
     powers = np.stack([weight * away[:, None] ** k for k in range(3)], axis=-1)  # (2, C, n, h, 3)
     moments = powers[0].swapaxes(-1, -2) @ light @ powers[1]  # (C, n, 3, 3)
-    square = (weight[..., None] * powers).sum(axis=-2)  # (2, C, n, 3)
-    noise = np.sqrt(square[0, ..., 0] * square[1, ..., 0])
+    square = weight[..., None] * powers
+    square = square[0].swapaxes(-1, -2) @ variance @ square[1]  # (C, n, 3, 3)
+    noise = np.sqrt(square[..., 0, 0])
     total = moments[..., 0, 0]
     good = whole & (total > BRIGHT_SIGMAS * noise)
     total = np.where(good, total, 1.0)
@@ -64,7 +67,7 @@ def centroids(image: InspectedImage) -> Centroids:
     response = 1 - second / (width**2)[:, None]
     good &= response > MIN_RESPONSE
     response = np.where(good, response, 1.0)
-    spread = square[0, ..., 2] * square[1, ..., 0] + square[0, ..., 0] * square[1, ..., 2]
+    spread = square[..., 2, 0] + square[..., 0, 2]
     error = np.sqrt(spread / 2) / total / response
     error = np.where(good, np.hypot(error, FLOOR_PX), np.inf)
     offsets = first / (total * response)[..., None]

@@ -54,10 +54,8 @@ class ImagePlane:
     @classmethod
     def of(cls, image, c) -> ImagePlane:
         """Channel c of an InspectedImage."""
-        usable = image.usable[c]
-        data = np.where(usable, image.observation.data[c] - image.level[c], 0) / image.sigma[c]
         psf = image.observation.psf[c]
-        return cls(data.astype(np.float32), usable, psf, image.matrix, image.offset)
+        return cls(image.brightness[c], image.usable[c], psf, image.matrix, image.offset)
 
 
 def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, np.ndarray]:
@@ -66,41 +64,75 @@ def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, n
     places (n, 2) [model px]: of the sources
     returns shifts (n, 2) [px of other] and their errors (n,), infinite where they are not measured
     """
-    # a position p in `other` lies at matrix p + offset in `one`
-    matrix = one.matrix @ np.linalg.inv(other.matrix)
-    offset = one.offset - matrix @ other.offset
-    area = abs(np.linalg.det(matrix))
-    shape = other.data.shape
-    at = (np.stack([*np.indices(shape)], axis=-1) @ matrix.T + offset).transpose(2, 0, 1)
-    smear, there = Blur(one, other.psf, matrix), Blur(other, one.psf, np.linalg.inv(matrix))
-    near = places @ other.matrix.T + other.offset
-    radius = RADIUS_FWHM * max(other.psf.fwhm_px[0], one.psf.fwhm_px[0] / np.sqrt(area))
-    top = np.array(one.data.shape)[:, None, None] - 1
-    # splines of light that is cut at the edge lie below it within a pixel
-    good = other.usable & ((at >= 1) & (at <= top - 1)).all(axis=0) & ~there.hidden
-    if smear.hidden.any():
-        good &= map_coordinates(smear.hidden.astype(np.float32), at, order=1, mode="nearest") < 0.5
-    about = _within(shape, near, radius)
-    good &= about
-    if good.sum() < MIN_PIXELS + 3 * len(places):
+    pair = Matched.of(one, other, places, RADIUS_FWHM)
+    if pair.good.sum() < MIN_PIXELS + 3 * len(places):
         return np.zeros((len(places), 2)), np.full(len(places), np.inf)
     owner = _nearest(one.data.shape, places @ one.matrix.T + one.offset)
-    # with a pixel more on each side, from which slopes follow
-    window = tuple(
-        slice(max(lit[0] - 1, 0), lit[-1] + 2)
-        for lit in (np.flatnonzero(about.any(axis=axis)) for axis in (1, 0))
+    images = [pair.light(one.data * (owner == s)) for s in range(len(places))]
+    good = pair.good[pair.window]
+    shifts, errors, brightness = _solved(images, pair.there(), good, np.sqrt(pair.area))
+    near = pair.near - [part.start for part in pair.window]
+    parts = np.array(
+        [_foreign(images, brightness, s, near[s], pair.radius) for s in range(len(near))]
     )
-    near = near - [part.start for part in window]
-    lights = (one.data * (owner == s) for s in range(len(places)))
-    options = {"order": 3, "mode": "constant", "prefilter": False, "output": float}
-    images = [
-        area * map_coordinates(smear.of(light, spline=True), at[:, *window], **options)
-        for light in lights
-    ]
-    there = there.of(other.data)[window].astype(float)
-    shifts, errors, brightness = _solved(images, there, good[window], np.sqrt(area))
-    parts = np.array([_foreign(images, brightness, s, near[s], radius) for s in range(len(near))])
-    return shifts, np.hypot(errors, COLOUR * parts * radius)
+    return shifts, np.hypot(errors, COLOUR * parts * pair.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Two ImagePlanes, each to be convolved with the other's PSF, at the pixels of the second one.
+
+    at (2, My, Mx) [px of the first]: of these pixels; area: pixels of the first in one of them
+    near (n, 2), radius [px]: of the sources' pixels; good (My, Mx): bool, those compared
+    window: slices of all of them, with a pixel more on each side, from which slopes follow
+    smear, smear_there: Blur of the first and of the second
+    """
+
+    other: ImagePlane
+    at: np.ndarray
+    area: float
+    near: np.ndarray
+    radius: float
+    good: np.ndarray
+    window: tuple[slice, slice]
+    smear: Blur
+    smear_there: Blur
+
+    @classmethod
+    def of(cls, one, other, places, radius_fwhm) -> Matched:
+        """The pixels of ImagePlanes within some FWHM of the wider PSF of places (n, 2) [model px].
+
+        The window is empty without any.
+        """
+        # a position p in `other` lies at matrix p + offset in `one`
+        matrix = one.matrix @ np.linalg.inv(other.matrix)
+        offset = one.offset - matrix @ other.offset
+        area = abs(np.linalg.det(matrix))
+        shape = other.data.shape
+        at = (np.stack([*np.indices(shape)], axis=-1) @ matrix.T + offset).transpose(2, 0, 1)
+        smear, there = Blur(one, other.psf, matrix), Blur(other, one.psf, np.linalg.inv(matrix))
+        near = places @ other.matrix.T + other.offset
+        radius = radius_fwhm * max(other.psf.fwhm_px[0], one.psf.fwhm_px[0] / np.sqrt(area))
+        top = np.array(one.data.shape)[:, None, None] - 1
+        # splines of light that is cut at the edge lie below it within a pixel
+        good = other.usable & ((at >= 1) & (at <= top - 1)).all(axis=0) & ~there.hidden
+        if smear.hidden.any():
+            hidden = smear.hidden.astype(np.float32)
+            good &= map_coordinates(hidden, at, order=1, mode="nearest") < 0.5
+        about = _within(shape, near, radius)
+        lit = [np.flatnonzero(about.any(axis=axis)) for axis in (1, 0)]
+        y, x = (slice(max(on[0] - 1, 0), on[-1] + 2) if on.size else slice(0) for on in lit)
+        return cls(other, at, area, near, radius, good & about, (y, x), smear, there)
+
+    def light(self, data) -> np.ndarray:
+        """Data of the first one at the pixels of the window, behind both PSFs."""
+        options = {"order": 3, "mode": "constant", "prefilter": False, "output": float}
+        spline = self.smear.of(data, spline=True)
+        return self.area * map_coordinates(spline, self.at[:, *self.window], **options)
+
+    def there(self) -> np.ndarray:
+        """Data of the second one at the pixels of the window, behind both PSFs."""
+        return self.smear_there.of(self.other.data)[self.window].astype(float)
 
 
 def _foreign(images, brightness, s, place, radius):

@@ -1,4 +1,4 @@
-"""One observation for inspection: significance of its pixels, positions of the sources."""
+"""One observation for inspection: light of its pixels, positions of the sources."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class InspectedImage:
         with np.errstate(invalid="ignore"):
             inside = np.all((places >= -0.5) & (places < shape - 0.5), axis=1)
         usable = observation.weights > 0
-        sigma = np.array([_typical_sigma(w) for w in observation.weights])
+        sigma = typical_sigma(observation.weights)
         matrix = solution[:2].T
         matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0  # upright grids stay upright
         offset = solution[2] - matrix @ shift
@@ -74,6 +74,10 @@ class InspectedImage:
     def over(self, level) -> InspectedImage:
         """The same InspectedImage with the level (C,) [counts] of its sky known."""
         return replace(self, level=level)
+
+    def moved(self, shift) -> InspectedImage:
+        """The same InspectedImage of the observation moved by a further shift (2,) [model px]."""
+        return replace(self, offset=self.offset - self.matrix @ shift)
 
     def without(self, pixels) -> InspectedImage:
         """The same InspectedImage of the observation with the pixels (C, My, Mx) masked."""
@@ -87,23 +91,46 @@ class InspectedImage:
         return np.where(self.usable, data * np.sqrt(self.observation.weights), 0).astype(np.float32)
 
     @cached_property
+    def brightness(self) -> np.ndarray:
+        """Data above the level (C, My, Mx) [sigma of a typical pixel], 0 where not usable; float32.
+
+        Its shape is that of the light. That of the significance is flatter under photon noise.
+        """
+        data = self.observation.data - self.level[:, None, None]
+        return brightness(data, self.usable, self.sigma)
+
+    @cached_property
+    def variance(self) -> np.ndarray:
+        """Variance of `brightness` (C, My, Mx), 0 where not usable; float32."""
+        found = np.zeros(self.usable.shape, np.float32)
+        precision = self.observation.weights * self.sigma[:, None, None] ** 2
+        return np.divide(1, precision, out=found, where=self.usable, casting="same_kind")
+
+    @cached_property
     def smooth(self) -> np.ndarray:
         """Signal to noise (My, Mx) of points, all channels together with equal weight [1].
 
         Smoothed with a Gaussian as wide as the PSF: near a matched filter, whatever the PSF.
         """
+        return self._smoothed(self.significance)
+
+    @cached_property
+    def smooth_brightness(self) -> np.ndarray:
+        """`brightness` smoothed as `smooth` (My, Mx): the shape of the light."""
+        return self._smoothed(self.brightness)
+
+    def _smoothed(self, values):
         from scipy.ndimage import gaussian_filter
 
         width = max(self.width_px / SIGMAS_A_FWHM, 0.5)  # narrower ones are a single pixel
-        total = self.significance.sum(axis=0) / np.sqrt(len(self.significance))
+        total = values.sum(axis=0) / np.sqrt(len(values))
         smooth = gaussian_filter(total, width, mode="constant", truncate=3.0)
         return smooth * (2 * np.sqrt(np.pi) * width)
 
     @cached_property
     def light(self) -> np.ndarray:
         """Signal to noise (S,) of the pixel of `smooth` at each source; 0 outside the image."""
-        y, x = self._nearest()
-        return np.where(self.inside, self.smooth[y, x], 0)
+        return self.at_sources(self.smooth)
 
     @cached_property
     def brightest(self) -> np.ndarray:
@@ -111,10 +138,11 @@ class InspectedImage:
         order = np.argsort(-self.light, kind="stable")
         return order[self.inside[order]][:MAX_SOURCES]
 
-    def _nearest(self):
-        """Nearest pixels (2, S) of the image to the sources."""
+    def at_sources(self, values) -> np.ndarray:
+        """Values (S,) of an image (My, Mx) in the pixels of the sources; 0 outside the image."""
         top = np.array(self.usable.shape[1:]) - 1
-        return np.clip(np.rint(np.nan_to_num(self.places)).astype(int), 0, top).T
+        y, x = np.clip(np.rint(np.nan_to_num(self.places)).astype(int), 0, top).T
+        return np.where(self.inside, values[y, x], 0)
 
     @cached_property
     def width_px(self) -> float:
@@ -147,6 +175,16 @@ class InspectedImage:
         n_y, n_x = self.usable.shape[1:]
         on = (y >= 0) & (y < n_y) & (x >= 0) & (x < n_x)
         return np.clip(y, 0, n_y - 1), np.clip(x, 0, n_x - 1), on
+
+
+def brightness(data, usable, sigma) -> np.ndarray:
+    """Data (C, My, Mx) in units of sigma (C,), 0 where not usable; float32."""
+    return np.where(usable, data / sigma[:, None, None], 0).astype(np.float32)
+
+
+def typical_sigma(weights) -> np.ndarray:
+    """Noise [counts] of a typical pixel of each channel (C,) of weights (C, My, Mx)."""
+    return np.array([_typical_sigma(channel) for channel in weights])
 
 
 def _typical_sigma(weights):

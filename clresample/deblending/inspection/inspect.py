@@ -12,6 +12,7 @@ from ..blend import Blend
 from ..settings import AUTO, SMALL, FitSettings
 from . import listing, shifted, spoilt
 from .centroids import centroids
+from .counts import count_lines
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
 from .noisy_variance import prepared
@@ -123,6 +124,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         images.append(image)
     messages += _offset(images, found)
     moved, lines = shifted.disagreements(images, found, settings.fit_shifts)
+    lines += count_lines(images if moved is None else map(InspectedImage.moved, images, moved))
     move = moved is not None if settings.fit_shifts == AUTO else bool(settings.fit_shifts)
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):

@@ -59,25 +59,26 @@ def common_offset(found):
 
 def unlisted(image):
     """Peaks [(significance [sigma], y, x [px])] without a source at them, the brightest first."""
-    peaks = _peaks(image.smooth)
+    light = image.smooth_brightness
+    peaks = _peaks(light, image.smooth > UNLISTED_SIGMAS)
     places = image.places[np.isfinite(image.places).all(axis=1)]
     if not len(peaks) or not image.inside.any():
         return []  # sources that all lie outside are reported by themselves
-    values = image.smooth[*peaks.T]
+    values, listed = light[*peaks.T], image.at_sources(light)[image.inside]
     away = np.hypot(*(peaks[:, None] - places).T).T
     apart = away.min(axis=1) >= max(OWN_FWHM * image.width_px, OWN_PX)
-    bright = values >= UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
+    bright = values >= UNLISTED_PART * np.median(np.maximum(listed, 0))
     chosen = np.flatnonzero(apart & bright & image.on_frame(peaks))  # other pixels are not fitted
     if not len(chosen):
         return []
     # masked pixels may be of any brightness
-    smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
+    smooth = np.where(image.usable.all(axis=0), light, np.inf)
     unseen, found = _nearest_unseen(image.usable.any(axis=0)), []
     for i in chosen:
         y, x = peaks[i]
         ends = [unseen[y, x], *places[away[i].argsort()[:N_NEAREST]]]
         if not any(_joined(smooth, (y, x), values[i], place) for place in ends):
-            found.append((float(values[i]), int(y), int(x)))
+            found.append((float(image.smooth[y, x]), int(y), int(x)))
     return sorted(found, reverse=True)
 
 
@@ -90,10 +91,9 @@ def _nearest_unseen(usable):
     return np.moveaxis(nearest, 0, -1)[inner, inner] - MASKED_PX
 
 
-def _peaks(smooth):
-    """Local maxima (n, 2) above UNLISTED_SIGMAS, those on the outermost pixels left out."""
-    inner = smooth[1:-1, 1:-1]
-    top = inner > UNLISTED_SIGMAS
+def _peaks(smooth, chosen):
+    """Local maxima (n, 2) on chosen pixels (My, Mx), those on the outermost ones left out."""
+    inner, top = smooth[1:-1, 1:-1], chosen[1:-1, 1:-1].copy()
     if not top.any():
         return np.zeros((0, 2), int)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):

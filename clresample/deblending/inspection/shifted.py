@@ -30,28 +30,37 @@ MAX_ERROR_PX = 0.5
 def disagreements(images, found, fit_shifts):
     """Shifts (n_observations, 2) [model px] that align disagreeing observations; 0 for the first.
 
-    None without disagreement. Also returns a sentence on each, and on channels that disagree.
+    None without disagreement. Also returns a sentence on each, and on channels that disagree. Right
+    are the most that agree, of equally many those with the sharpest image.
 
     images, found: InspectedImage and Centroids of each observation; fit_shifts: see Settings, with
         True nothing is measured
     """
     if fit_shifts != AUTO and fit_shifts:
         return None, []
-    lines, moved = [], np.zeros((len(images), 2))
-    first = sharpest(images)
+    lines, first = [], sharpest(images)
+    shifts, errors = np.zeros((2, len(images), 2))
     for i, image in enumerate(images):
         lines += _channel_lines(image, found[i])
         if i == first:
             continue
         shift, error = _between(images[first], found[first], image, found[i])
-        if not significant(shift, error):
-            continue
-        moved[i] = -shift
-        names = [images[k].observation.label for k in (first, i)]
-        cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
+        if significant(shift, error):
+            shifts[i], errors[i] = shift, error
+        elif not error.max() < MIN_SHIFT_PX:
+            shifts[i] = np.nan  # not measured
+    apart = np.hypot(*(shifts[:, None] - shifts).transpose(2, 0, 1))
+    agreeing = (apart < MIN_SHIFT_PX).sum(axis=1) + 0.5 * (np.arange(len(images)) == first)
+    right = int(agreeing.argmax())
+    moved = np.where(apart[right, :, None] >= MIN_SHIFT_PX, shifts[right] - shifts, 0.0)
+    errors = np.hypot(errors, errors[right])
+    name = images[right].observation.label
+    cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
+    for i in np.flatnonzero(moved.any(axis=1)):
         lines.append(
-            f"light in {names[1]} lies away from that in {names[0]}: by ({shift[0]:+.2f}, "
-            f"{shift[1]:+.2f}) +- {error.max():.1g} model pixels (y, x); their WCS disagree; {cure}"
+            f"light in {images[i].observation.label} lies away from that in {name}: by "
+            f"({-moved[i, 0]:+.2f}, {-moved[i, 1]:+.2f}) +- {errors[i].max():.1g} model pixels "
+            f"(y, x); their WCS disagree; {cure}"
         )
     return (moved - moved[0] if fit_shifts and moved.any() else None), lines
 
@@ -85,9 +94,7 @@ def _between(one, its, other, theirs):
         ends.append((offsets @ inverse.T, errors * np.sqrt(abs(np.linalg.det(inverse)))))
     (first, first_error), (second, second_error) = ends
     shift, error = common(second - first, np.hypot(first_error, second_error))
-    if not _suspect(shift, error, MIN_SHIFT_PX):
-        return shift, np.full(2, np.inf)
-    return _closer(one, other)
+    return _closer(one, other) if _suspect(shift, error, MIN_SHIFT_PX) else (shift, error)
 
 
 def _closer(one, other):

@@ -119,27 +119,25 @@ def sharper_than_psf(image) -> np.ndarray:
 
         kappa v > v_up + v_down + 6 sigma + uncertainty of the PSF, or the same along x
 
-    kappa: `psf_samples.pair_ratios`. No pixel is selected if equally many pixels are equally
-    negative, because the noise is then larger than the weights imply. Pixels beside unusable ones
-    and on the edge are not selected.
+    v, sigma: light of a pixel, and the noise of these three; kappa: `psf_samples.pair_ratios`. No
+    pixel is selected if equally many pixels are equally negative, because the noise is then larger
+    than the weights imply. Pixels beside unusable ones and on the edge are not selected.
     """
-    z, usable = image.significance, image.usable
+    z, v, variance, usable = image.significance, image.brightness, image.variance, image.usable
     found = np.zeros(z.shape, bool)
     kappa = pair_ratios(image.observation.psf)
-    noise = SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
-    with np.errstate(divide="ignore"):
-        least = (noise / kappa).min(axis=1)  # beside pixels without light
-    c, y, x = np.nonzero(z[:, 1:-1, 1:-1] > least[:, None, None].astype(np.float32))
+    c, y, x = np.nonzero(z[:, 1:-1, 1:-1] > SHARP_SIGMAS)
     y, x, rest, inner = y + 1, x + 1, [], []
     for axis, (dy, dx) in enumerate(((1, 0), (0, 1))):
         before, after = (c, y - dy, x - dx), (c, y + dy, x + dx)
-        pair = np.maximum(z[before] + z[after], 0)
-        rest.append(kappa[c, axis] * z[c, y, x] - pair - noise[c, axis])
+        pair, own = np.maximum(v[before] + v[after], 0), kappa[c, axis]
+        noise = np.sqrt(own**2 * variance[c, y, x] + variance[before] + variance[after])
+        rest.append(own * v[c, y, x] - pair - SHARP_SIGMAS * noise)
         inner.append(usable[before] & usable[after])
     sharp = np.max(rest, axis=0) > 0
     if not sharp.any() or (z < -SHARP_SIGMAS).sum() > sharp.sum() / 4:
         return found
     excess, sure, at = (np.array(v)[..., sharp] for v in (rest, inner, (c, y, x)))
-    near = [z[k, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3].max() for k, i, j in at.T]
+    near = [v[k, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3].max() for k, i, j in at.T]
     found[*at] = (sure & (excess > NEIGHBOUR_PART * np.array(near))).any(axis=0)
     return found

@@ -55,25 +55,25 @@ class StarCore:
     light: float
     masked: np.ndarray
 
-    def grown(self, significance, usable, margin):
+    def grown(self, brightness, usable, margin):
         """The masked pixels (My, Mx), grown by a margin [px] as far as the star's light allows.
 
         They grow by whole pixels while the light beside them remains that of a core.
-        significance, usable: see `star_cores`
+        brightness, usable: see `star_cores`
         """
         grown = self.masked
         for _ in range(margin):
             wider = binary_dilation(grown, np.ones((3, 3), bool))
-            if _brightest_beside(significance, usable & ~wider, wider) < MIN_EDGE_SIGMAS:
+            if _brightest_beside(brightness, usable & ~wider, wider) < MIN_EDGE_SIGMAS:
                 break
             grown = wider
         return grown
 
 
-def star_cores(significance, usable, psf, band) -> list[StarCore]:
+def star_cores(brightness, usable, psf, band) -> list[StarCore]:
     """Finds the stars with a masked core in a channel, the brightest first.
 
-    significance (My, Mx) [sigma]: data over the noise, 0 where not usable; usable (My, Mx): bool,
+    brightness (My, Mx) [sigma of a typical pixel]: data, 0 where not usable; usable (My, Mx): bool,
     pixels with a weight that are not saturated; psf: PSF; band: number of its band
     """
     fwhm = float(psf.fwhm_px[band])
@@ -91,7 +91,7 @@ def star_cores(significance, usable, psf, band) -> list[StarCore]:
             continue
         least = MIN_EDGE_SIGMAS if (deep[window] & own).any() else MIN_NARROW_EDGE_SIGMAS
         window = tuple(slice(max(s.start - reach, 0), s.stop + reach) for s in window)
-        own, light = groups[window] == k, significance[window]
+        own, light = groups[window] == k, brightness[window]
         if not _brightest_beside(light, usable[window], own) >= least:
             continue
         core = _core(light, usable[window], own, psf, band, fwhm)

@@ -127,7 +127,7 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
     if not stars or image.usable.all():
         return image, n_wide, n_own
     for c, usable in enumerate(image.usable):
-        for core in star_cores(image.significance[c], usable, image.observation.psf, c):
+        for core in star_cores(image.brightness[c], usable, image.observation.psf, c):
             away = np.hypot(*(image.places[stars] - core.place).T)
             if away.min() < max(core.radius, 1.0):
                 is_wide = core.radius > MIN_STAR_RADIUS_FWHM * image.observation.psf.fwhm_px[c]
@@ -138,7 +138,7 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
             del found[i]
     grown = np.zeros(image.usable.shape, bool)
     for c, (core, is_wide) in (pair for cores in found.values() for pair in cores.items()):
-        given = image.significance[c], image.usable[c], WIDE_GROW_PX if is_wide else GROW_PX
+        given = image.brightness[c], image.usable[c], WIDE_GROW_PX if is_wide else GROW_PX
         grown[c] |= image.usable[c] & core.grown(*given)
     image = image.without(grown) if grown.any() else image
     sky = sky_beside_wide if n_wide.any() else sky
