@@ -11,7 +11,11 @@ from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages, local_chi2
 from clresample.deblending.linear.rendered_models import RenderedModel
-from clresample.deblending.posterior.bound_bias import negative_chi2_gradient
+from clresample.deblending.posterior.bound_bias import (
+    negative_chi2_gradient,
+    release_factor,
+    within_errors,
+)
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import bounded_fluxes, fluxes
 from clresample.sky.frame import Frame
@@ -115,6 +119,28 @@ def test_fluxes_without_light_are_not_biased_by_noise(device):
     flags = np.array([catalogue(r)["flags"] for r in results])
     none = (np.array([bounded_fluxes(r) for r in results]) == 0).any(axis=2)
     np.testing.assert_array_equal((flags & Flag.ZERO_FLUX) > 0, none)
+
+
+@pytest.mark.parametrize(("sigma", "left"), [(0.0, 0.0), (2.9, 2.9), (9.0, 1.0), (300.0, 0.03)])
+def test_steps_that_noise_does_not_cause_are_not_taken(sigma, left):
+    assert sigma * release_factor(np.array(sigma**2)) == pytest.approx(left)
+
+
+@pytest.mark.parametrize("change", [[2.0, -1.0, 0.5], [12.0, -11.0, 0.5], [-3.0, -40.0, 2.0]])
+def test_light_exchanged_within_errors_is_kept(change):
+    """Two sources whose sum is known to a hundredth of their fluxes, and another one."""
+    sigma, known = 10.0, 0.1
+    exchange = np.array([1, -1, 0]) * sigma
+    covariance = np.outer(exchange, exchange) + known**2 * np.eye(3)
+    error = np.sqrt(np.diag(covariance))
+    changes = np.array([change, np.zeros(3)]) * error
+    found = within_errors(changes, np.array([covariance] * 2))
+    assert (np.abs(found / error) <= 3 + 1e-9).all() and not found[1].any()
+    if (np.abs(changes) <= 3 * error).all():
+        np.testing.assert_array_equal(found, changes)
+    elif abs(changes[0, :2].sum()) < 2 * sigma:
+        assert found[0, :2].sum() == pytest.approx(changes[0, :2].sum(), abs=3 * known)
+    assert found[0, 2] == changes[0, 2]
 
 
 def test_chi2_is_that_where_a_components_light_is():

@@ -316,3 +316,13 @@ def test_second_moments_of_stars_have_no_error_and_are_not_released():
         assert np.isfinite(found[:2, :2]).all() and np.isfinite(found[2:, 2:]).all() == known
         assert np.isnan(found[:2, 2:]).all() != known
         assert (moved[:2] != 0).all() and ((moved[2:] != 0) == known).all()
+
+
+@pytest.mark.parametrize("times", [1e5, 1e8])
+def test_no_flux_is_corrected_by_more_than_three_errors(times):
+    """However far the bounds' release moves the unknowns together."""
+    made, _ = made_up(np.random.default_rng(0))
+    made.released = [times * change for change in made.released]
+    errors = made.errors(OWNER, np.ones((2, 2)), np.ones(2), 0.0)
+    error = np.sqrt(np.einsum("css->sc", errors.flux))
+    assert np.abs(errors.flux_correction / error).max() <= 3 + 1e-9

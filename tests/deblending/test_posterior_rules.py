@@ -287,10 +287,10 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
         assert (made.layout.n_sky, made.layout.n_shifts) == (5 * sky, 4 * shifts)
         right = [part.tolist() for part in asked.pop()]
         n_common = [5 * sky + 4 * shifts] if sky or shifts else []
-        of_spectra = [0, -1, 0, 0, pytest.approx(-3 / np.sqrt(0.5))]  # the last by three errors
+        of_spectra = [0, -1, 0, 0, pytest.approx(-30 * 9 / 450)]  # the last would move sqrt(450)
         assert right == [[0.0] * 5, [1, 2, *of_spectra], *([0.0] * n for n in n_common)]
-    made._released([np.zeros(0), np.array([30.0, -40.0])])  # by sqrt(2000) errors
-    np.testing.assert_allclose(asked.pop()[1][:2], np.array([30, -40]) * 3 / np.sqrt(2000))
+    made._released([np.zeros(0), np.array([30.0, -40.0])])  # sqrt(2000) errors
+    np.testing.assert_allclose(asked.pop()[1][:2], np.array([30, -40]) * 9 / 2000)
 
 
 def test_the_bound_holds_modes_where_there_is_no_light():

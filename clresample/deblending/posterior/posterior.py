@@ -20,7 +20,7 @@ from ..linear.block_matrix import BlockCholesky
 from ..linear.mode_images import ModeImages
 from ..linear.normal import UnknownLayout, normal_matrix
 from ..result import noted
-from .bound_bias import negative_chi2_gradient
+from .bound_bias import negative_chi2_gradient, release_factor, within_errors
 from .errors import Errors, MorphologyErrors, PosteriorSampler
 from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import light_sums, moment_derivatives
@@ -39,10 +39,6 @@ MIN_ERROR = 1e-9
 # galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of their errors,
 # and three without this contribution (bench.ladder).
 FAR_ERROR = 0.3
-# [sigma] Largest correction of a component for the bound at 0. For 98 in 100 simulated galaxies the
-# noise causes less. Galaxies with negative light, of which images of COSMOS have much, would have
-# up to 600, which must not affect their neighbours.
-MAX_BOUND_RELEASE_SIGMA = 3.0
 
 
 class Posterior:
@@ -86,9 +82,9 @@ class Posterior:
         right = [np.zeros(size) for size in self.layout.sizes]
         for i, pull in enumerate(held):
             k, own = len(pull), self.covariance.block(i, i)
-            right[i][:k] = pull * _release_factor(pull @ own[:k, :k] @ pull)
+            right[i][:k] = pull * release_factor(pull @ own[:k, :k] @ pull)
             pull = self.layout.by_band(self.solution.held[i])
-            right[i][k:] = pull * _release_factor(pull**2 * np.diag(own)[k:])
+            right[i][k:] = pull * release_factor(pull**2 * np.diag(own)[k:])
         return self.factor.solve(right)
 
     def errors(self, owner, residuals, unit, flux_error_floor) -> Errors:
@@ -115,6 +111,10 @@ class Posterior:
             if s == t:
                 found = part @ slopes[j].T
                 colour[s] += found if i == j else found + found.T
+        released = np.zeros(flux.shape)
+        for s, slope, change in zip(owner, slopes, self.released, strict=False):
+            released[s] += slope @ change
+        released = within_errors(released.T, between).T
         floor, far = np.zeros((2, *flux.shape))
         for i, (slope, beyond) in enumerate(zip(slopes, self.beyond, strict=True)):
             spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
@@ -125,9 +125,6 @@ class Posterior:
             between[:, np.arange(n_sources), np.arange(n_sources)] += common.T**2
             colour += common[:, :, None] * common[:, None, :]
         error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))
-        released = np.zeros(flux.shape)
-        for s, slope, change in zip(owner, slopes, self.released, strict=False):
-            released[s] += slope @ change
         moments, moved = self._moments(owner, n_sources, error)
         scale = wide[:, None] * unit
         return Errors(
@@ -196,11 +193,6 @@ class Posterior:
                 moved[source, 2:] = 0
             out[source] = covariance
         return out, moved
-
-
-def _release_factor(change):
-    """Factor of Newton steps with these expected changes of chi2, by MAX_BOUND_RELEASE_SIGMA."""
-    return np.minimum(1, MAX_BOUND_RELEASE_SIGMA / np.sqrt(np.maximum(change, 1e-60)))
 
 
 def with_errors(fit, result, peaks, seen):
