@@ -243,6 +243,7 @@ def _model(fit) -> MorphologyModel:
         fit.start.source,
         fit.scene.origin,
         _scaled(fit.state),
+        min_light=[shape.min_light for shape in fit.start.shapes],
     )
 
 

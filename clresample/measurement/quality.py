@@ -6,6 +6,7 @@ import numpy as np
 
 from ..deblending.assessment.status import misfitted_sources
 from ..deblending.posterior.residuals import pixels_in_boxes
+from ..deblending.posterior.sampling import undetermined
 from ..deblending.result import Result
 from ..sky.sources import PointSource
 from ..sky.validation.checks import check_instance
@@ -91,11 +92,12 @@ def masked_cores(result, positions):
 
     The core consists of the pixels within half of the PSF's FWHM of the position (S, 2)
     [model px], and the pixel at the position. The criterion is one pixel without weight for a point
-    source. For others it is half of the core, and a neighbouring pixel of over 20 sigma, since
-    faint sources do not saturate.
+    source, in a channel with enough of its light to determine a flux. For others it is half of the
+    core, and a neighbouring pixel of over 20 sigma, since faint sources do not saturate.
     """
     found = np.zeros(len(result.sources), dtype=bool)
-    for footprint in result.footprints:
+    lost = undetermined(result)
+    for channels, footprint in zip(result.channel_slices(), result.footprints, strict=True):
         observation = footprint.observation
         masked = observation.weights == 0
         if not masked.any():
@@ -108,7 +110,7 @@ def masked_cores(result, positions):
             if not (masked & core).any():
                 continue
             if isinstance(result.sources[i], PointSource):
-                found[i] = True
+                found[i] = (masked & core)[~lost[i, channels]].any()
                 continue
             half = 2 * (masked & core).sum(axis=(1, 2)) >= core.sum(axis=(1, 2))
             beside = ~masked & (distance <= BESIDE * radius[:, None, None])

@@ -20,6 +20,7 @@ from .equations import ImageProducts
 from .slot_observation import SlotObservation
 from .spectra import nnls_batch, spectrum_covariance
 from .ties import band_equations
+from .unseen import unseen_spectra
 
 
 def linearise(views, components, precision, tolerance, *, fit_sky) -> LinearisedScenes:
@@ -160,13 +161,22 @@ class LinearisedScenes:
                 at, own = (slice(None), channels), [x[:, channels] for x in levels]
                 self.normal[at], _, self.right[at] = products.with_spectra(part, own)
         self.right += np.einsum("kcij,kcj->kci", self.normal, self.solution())
-        normal, right, own, value = self._band_equations()
-        n = self.n_most
-        found = nnls_batch(normal.reshape(-1, n, n), right.reshape(-1, n)).reshape(right.shape)
-        found = self._spread(found, axis=1)
+        found, own, value = self._spectra()
+        unseen = unseen_spectra(self, found)
+        if unseen.any():
+            self.normal[:, :, :-1][unseen] = self.normal.swapaxes(2, 3)[:, :, :-1][unseen] = 0
+            self.right[..., :-1][unseen] = 0
+            found, own, value = self._spectra()
         self.spectra[self.at] = found[self.rows, :, self.index[self.at]]
         if self.fit_sky:
             self.sky[self.scenes] = value - (own * found).sum(axis=-1)
+
+    def _spectra(self):
+        """Spectra (k, C, n) of the present equations, and the levels' own of `band_equations`."""
+        normal, right, own, value = self._band_equations()
+        n = self.n_most
+        found = nnls_batch(normal.reshape(-1, n, n), right.reshape(-1, n)).reshape(right.shape)
+        return self._spread(found, axis=1), own, value
 
     def with_components(self, components) -> LinearisedScenes:
         """The same observations with other components."""

@@ -9,7 +9,7 @@ import numpy as np
 from ...resampling.plan import Precision
 from ...sky.box import intersect_boxes
 from ..component_images import ComponentImages
-from ..profiles import ComponentProfile
+from ..profiles import MIN_LIGHT, ComponentProfile
 from ..view import WhitenedView
 from .component_batch import StartComponent
 from .linearised_scenes import linearise
@@ -30,6 +30,7 @@ class MorphologyModel:
     source (n,): number of each one's source, which selects its PSF in the views
     origin (n, 2) [px], morphs (n): arrays (ny, nx), in boxes of the frame
     spectra (n, C), sky (C,): those about which slopes are asked for, None for none
+    min_light (n,) [1]: of their ComponentProfiles; None: that of galaxies
     """
 
     frame: tuple[int, int]
@@ -40,6 +41,7 @@ class MorphologyModel:
     morphs: list
     spectra: np.ndarray | None = None
     sky: np.ndarray | None = None
+    min_light: list | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +85,9 @@ class _ImageProfile(ComponentProfile):
     frame (2,) [px]: its shape
     """
 
-    def __init__(self, image, origin, frame):
+    def __init__(self, image, origin, frame, min_light):
         self.image, self.origin, self.frame = image, np.asarray(origin), np.array(frame)
+        self.light, self.min_light = image.sum(), min_light
 
     def bounding_box(self, theta, position, threshold):
         """All of the box, or of the frame if that is small."""
@@ -151,7 +154,9 @@ def model_of(fit, which=()):
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
     spectra = np.concatenate([fit.state.spectra, np.zeros_like(fit.state.spectra[which])])
-    given = source, origin, morphs + cores, spectra, fit.state.sky
+    least = [shape.min_light for shape in fit.start.shapes]
+    least += [least[i] for i in which]
+    given = source, origin, morphs + cores, spectra, fit.state.sky, least
     return MorphologyModel(fit.padded.shape, fit.views, bare, *given)
 
 
@@ -159,9 +164,10 @@ def _rendered(models, views, fit_sky):
     """The LinearisedScenes of MorphologyModels in views of each, rendered but not whitened."""
     components = []
     for b, model in enumerate(models):
-        rows = zip(model.source, model.origin, model.morphs, strict=True)
-        for i, (source, origin, morph) in enumerate(rows):
-            shape = _ImageProfile(morph, origin, model.frame)
+        least = model.min_light or [MIN_LIGHT] * len(model.morphs)
+        rows = zip(model.source, model.origin, model.morphs, least, strict=True)
+        for i, (source, origin, morph, lowest) in enumerate(rows):
+            shape = _ImageProfile(morph, origin, model.frame, lowest)
             place = np.asarray(origin, float)
             components.append(StartComponent(b, i, int(source), shape, place, model.frame))
     precision, n = Precision.of(views[0][0].op.dtype), len(components)

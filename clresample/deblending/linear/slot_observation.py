@@ -208,6 +208,13 @@ class SlotObservation:
         given = {"residual": self.residual, "root": self.root}
         return self._sums("residual_products", len(self.place), (n_images, 2), **given)
 
+    def light_on_pixels(self):
+        """Returns the light (slots, Co) on pixels with weight, less where errors lower weights."""
+        root = self.device.get(self.root)
+        used = np.divide(1, root, out=np.zeros_like(root), where=root > 0)
+        given = {"residual": self.residual, "root": self.device.put(used)}
+        return self._sums("residual_products", len(self.place), (1, 2), **given)[:, :, 0, 1]
+
     def _sums(self, name, n, shape, **given):
         """Sums (n, Co, *shape) over pixels by a kernel of start.cl, in a group each."""
         out, group = self.device.empty((n, self.n_bands, *shape), self.dtype), self.tuning.sum_group

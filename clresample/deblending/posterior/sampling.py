@@ -9,16 +9,7 @@ import numpy as np
 from ...sky.sources import PointSource
 from ..component_images import image_within, window_of
 from ..linear.ties import Ties
-
-# [1] Least part of a component's light on pixels with weight of a band that determines its flux.
-# Of galaxies in simulated images that lack a band beside them (144 scenes) 18 of 205 fluxes with
-# less than 1 % are over 5 errors off, up to 3e5 times the truth, as errors of wings far below the
-# noise are unknown; one of 49 with 1 to 5 %, of which three have a signal to noise over 5; none of
-# 25 with 5 to 20 %, of which eleven have.
-MIN_LIGHT = 0.05
-# The same of a star, whose wings are its PSF's: fluxes of stars with masked cores that leave 0.2 to
-# 17 % of the light are within two errors.
-MIN_STAR_LIGHT = 1e-3
+from ..profiles import MIN_LIGHT, MIN_STAR_LIGHT
 
 
 def drawn_components(result, rng):
