@@ -259,6 +259,16 @@ def test_observations_that_disagree_are_moved(shift):
     assert len(said.messages) == any(shift)
 
 
+@pytest.mark.parametrize("shift", [(1.6, -1.2), (-0.8, 1.4)])
+def test_a_sharp_observation_is_moved_by_more_than_its_psf(shift):
+    """Its light has no centroid about the listed places."""
+    there = tuple(((y + shift[0], x + shift[1]), f, s) for (y, x), f, s in DRAWN)
+    sharp = observed(image_of(there, sigma=0.8), sigma=0.8, name="sharp")
+    found = inspected([sharp, observed(image_of(seed=1, sigma=3), sigma=3, channels=("i", "z"))])
+    moved = found.shifts[0] - found.shifts[1]
+    np.testing.assert_allclose(moved, -np.array(shift), atol=0.2 * np.hypot(*shift))
+
+
 @pytest.mark.parametrize("odd, others, n_dark", [(0, 2, 0), (0, 3, 1), (2, 3, 0), (1, 1, 0)])
 def test_of_several_observations_the_one_that_disagrees_is_named(odd, others, n_dark):
     """The sharpest is the first; one without light is neither."""

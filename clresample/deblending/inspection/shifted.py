@@ -94,7 +94,10 @@ def _between(one, its, other, theirs):
         ends.append((offsets @ inverse.T, errors * np.sqrt(abs(np.linalg.det(inverse)))))
     (first, first_error), (second, second_error) = ends
     shift, error = common(second - first, np.hypot(first_error, second_error))
-    return _closer(one, other) if _suspect(shift, error, MIN_SHIFT_PX) else (shift, error)
+    # light may lie too far from its places for a centroid under the sharper PSF
+    lost = np.isinf(error).all() and np.isfinite([first_error, second_error]).any()
+    closer = lost or _suspect(shift, error, MIN_SHIFT_PX)
+    return _closer(one, other) if closer else (shift, error)
 
 
 def _closer(one, other):
