@@ -9,6 +9,7 @@ from helpers.told import named
 from clresample.deblending.component_images import ComponentImages, image_within, window_of
 from clresample.deblending.ended import Ended
 from clresample.deblending.linear.rendered_models import RenderedModel, model_of
+from clresample.deblending.profiles import ComponentProfile
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
@@ -198,7 +199,7 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
     fit = SimpleNamespace(
         scene=SimpleNamespace(profile=profile, origin=np.array([[1, 2], [3, 4], [5, 6]])),
         state=SimpleNamespace(morph=morphs, spectra=rng.random((3, 2)), sky=rng.random(2)),
-        start=SimpleNamespace(source=np.array([0, 0, 1])),
+        start=SimpleNamespace(source=np.array([0, 0, 1]), shapes=[ComponentProfile()] * 3),
         padded=SimpleNamespace(shape=(40, 41)),
         views=["a", "b"],
     )

@@ -9,6 +9,7 @@ import pytest
 from clresample.deblending import fit as room
 from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.fit import Fit
+from clresample.deblending.profiles import ComponentProfile
 from clresample.deblending.solver.scene import StructureState
 
 UNIT = np.array([2.0, 10.0, 0.5])
@@ -36,7 +37,9 @@ def ended(noise=(None, "correlated")):
         sky_level=np.array([0.5, -0.25, 2.0]),
         padded=SimpleNamespace(shape=(24, 32)),
         fitted=np.array([3, 5]),
-        start=SimpleNamespace(source=np.array([1, 1, 0]), thetas=["p", "q", "r"]),
+        start=SimpleNamespace(
+            source=np.array([1, 1, 0]), thetas=["p", "q", "r"], shapes=[ComponentProfile()] * 3
+        ),
         scene=SimpleNamespace(
             origin=np.array([(1, 2), (3, 4), (5, 6)]), fixed=np.array([False, False, True])
         ),

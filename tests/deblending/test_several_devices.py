@@ -33,7 +33,8 @@ def test_results_are_those_of_one_device(device):
             np.testing.assert_allclose(one.losses, other.losses, rtol=rtol)
             for a, b in zip(one.components, other.components):
                 np.testing.assert_allclose(a.morphology, b.morphology, rtol=0, atol=rtol)
-                np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=rtol)
+                atol = rtol * np.abs(b.spectrum).max()  # a channel may have hardly any light
+                np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=0, atol=atol)
 
 
 @pytest.fixture

@@ -85,7 +85,7 @@ class _ImageProfile(ComponentProfile):
     frame (2,) [px]: its shape
     """
 
-    def __init__(self, image, origin, frame, min_light):
+    def __init__(self, image, origin, frame, min_light=MIN_LIGHT):
         self.image, self.origin, self.frame = image, np.asarray(origin), np.array(frame)
         self.light, self.min_light = image.sum(), min_light
 
