@@ -8,8 +8,9 @@ to the minimum without the bounds, whose fluxes and moments do not have this bia
 
 The step is right only where noise may be its cause. Since the true light is not negative, a step of
 many errors comes from light that no model fits, or follows a nearly undetermined direction, such as
-light exchanged between sources, along which chi2 is not quadratic. Steps of over three errors are
-reduced by the square of their excess: one of 100 errors by a factor of a thousand. In images of one
+light exchanged between sources, along which chi2 is not quadratic. Steps of over three errors, or,
+along n modes, over sqrt(n / 2), are reduced by the square of their excess: one of 100 errors in
+three by a factor of a thousand. In images of one
 field by HST and HSC two thirds of all steps are longer than three errors, up to 700. Reduced to
 three errors each, those of all bands, along one direction, moved a source's flux by nine to twelve.
 """
@@ -42,12 +43,14 @@ def negative_chi2_gradient(scene, views, source, spectra, residuals):
     return out
 
 
-def release_factor(chi2_change):
+def release_factor(chi2_change, n_modes=1):
     """Factors of Newton steps that change chi2 by `chi2_change`, if chi2 is quadratic; see above.
 
-    The squares of the steps' lengths in errors.
+    The squares of the steps' lengths in errors. n_modes: along which each step leads; noise that is
+    on the bound along half of them changes chi2 by up to half their number.
     """
-    return np.minimum(1, MAX_BOUND_RELEASE_SIGMA**2 / np.maximum(chi2_change, 1e-60))
+    most = max(MAX_BOUND_RELEASE_SIGMA**2, n_modes / 2)
+    return np.minimum(1, most / np.maximum(chi2_change, 1e-60))
 
 
 def within_errors(changes, covariance):

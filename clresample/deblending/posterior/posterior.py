@@ -82,7 +82,7 @@ class Posterior:
         right = [np.zeros(size) for size in self.layout.sizes]
         for i, pull in enumerate(held):
             k, own = len(pull), self.covariance.block(i, i)
-            right[i][:k] = pull * release_factor(pull @ own[:k, :k] @ pull)
+            right[i][:k] = pull * release_factor(pull @ own[:k, :k] @ pull, k)
             pull = self.layout.by_band(self.solution.held[i])
             right[i][k:] = pull * release_factor(pull**2 * np.diag(own)[k:])
         return self.factor.solve(right)
