@@ -36,6 +36,14 @@
 #ifndef K           /* images of a slot: 1, or 5 with slopes */
 #define K 1
 #endif
+#ifndef PER_ROOT    /* 1: residual_products sums w a_i / root in place of w a_i root */
+#define PER_ROOT 0
+#endif
+#if PER_ROOT
+#define WITH_ROOT(wa, root) ((root) > 0 ? (wa) / (root) : 0)
+#else
+#define WITH_ROOT(wa, root) ((wa) * (root))
+#endif
 
 enum { SCENE, Y0, X0, WY, WX, N_IMAGES, BEGIN, N_PLACE };
 __kernel void whiten(__global const int *restrict place, const int n_bands, const int my,
@@ -219,12 +227,12 @@ void residual_products(__global const int *restrict place, const int n_bands, co
                 for (int k = 0; k < 8; ++k) {
                     const REAL wa = weight[line + x + k] * a[x + k];
                     one[k] += wa * residual[line + x + k];
-                    other[k] += wa * root[line + x + k];
+                    other[k] += WITH_ROOT(wa, root[line + x + k]);
                 }
             for (; x < x1 - x0; ++x) {
                 const REAL wa = weight[line + x] * a[x];
                 one[0] += wa * residual[line + x];
-                other[0] += wa * root[line + x];
+                other[0] += WITH_ROOT(wa, root[line + x]);
             }
             by_data[i] += SUM8(one);
             by_root[i] += SUM8(other);

@@ -80,7 +80,7 @@ class SlotObservation:
 
     def _launch(self, name, size, *, local_size=None, **arguments):
         """Queues a kernel of start.cl; K of them: images of a slot that are summed."""
-        n_images = arguments.pop("K", 1)
+        options = {"K": 1} | {k: arguments.pop(k) for k in ("K", "PER_ROOT") if k in arguments}
         launch = self.device.launcher(
             FILE,
             name,
@@ -88,7 +88,7 @@ class SlotObservation:
             local_size=local_size or self.tuning.local_size(3),
             ROWS=self.tuning.row_loops,
             WG=self.tuning.sum_group,
-            K=n_images,
+            **options,
         )
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 
@@ -210,9 +210,7 @@ class SlotObservation:
 
     def light_on_pixels(self):
         """Returns the light (slots, Co) on pixels with weight, less where errors lower weights."""
-        root = self.device.get(self.root)
-        used = np.divide(1, root, out=np.zeros_like(root), where=root > 0)
-        given = {"residual": self.residual, "root": self.device.put(used)}
+        given = {"residual": self.residual, "root": self.root, "PER_ROOT": 1}
         return self._sums("residual_products", len(self.place), (1, 2), **given)[:, :, 0, 1]
 
     def _sums(self, name, n, shape, **given):
