@@ -95,8 +95,7 @@ def masked_cores(result, positions):
     source, in a channel with enough of its light to determine a flux. For others it is half of the
     core, and a neighbouring pixel of over 20 sigma, since faint sources do not saturate.
     """
-    found = np.zeros(len(result.sources), dtype=bool)
-    lost = undetermined(result)
+    found, lost = np.zeros(len(result.sources), dtype=bool), None
     for channels, footprint in zip(result.channel_slices(), result.footprints, strict=True):
         observation = footprint.observation
         masked = observation.weights == 0
@@ -110,6 +109,7 @@ def masked_cores(result, positions):
             if not (masked & core).any():
                 continue
             if isinstance(result.sources[i], PointSource):
+                lost = undetermined(result) if lost is None else lost
                 found[i] = (masked & core)[~lost[i, channels]].any()
                 continue
             half = 2 * (masked & core).sum(axis=(1, 2)) >= core.sum(axis=(1, 2))

@@ -9,10 +9,10 @@ to the minimum without the bounds, whose fluxes and moments do not have this bia
 The step is right only where noise may be its cause. Since the true light is not negative, a step of
 many errors comes from light that no model fits, or follows a nearly undetermined direction, such as
 light exchanged between sources, along which chi2 is not quadratic. Steps of over three errors, or,
-along n modes, over sqrt(n / 2), are reduced by the square of their excess: one of 100 errors in
-three by a factor of a thousand. In images of one
-field by HST and HSC two thirds of all steps are longer than three errors, up to 700. Reduced to
-three errors each, those of all bands, along one direction, moved a source's flux by nine to twelve.
+along n modes, over sqrt(n / 2), are reduced by the square of their excess: one of 100 errors by a
+factor of a thousand where three is the limit. In images of one field by HST and HSC two thirds of
+all steps are longer than three errors, up to 700. Reduced to three errors each, those of all bands,
+along one direction, moved a source's flux by nine to twelve.
 """
 
 from __future__ import annotations
