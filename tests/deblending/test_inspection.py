@@ -14,6 +14,7 @@ from helpers.inspection import (
     looked_at,
     observed,
     sources_of,
+    stars,
     with_photon_noise,
 )
 
@@ -62,10 +63,22 @@ def test_sky_is_named_with_its_level(sky, words):
     assert inspected([o], fit_sky=True).messages == []
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_of_stars_in_all_of_an_image_no_level_is_found(seed):
+    """Their wings fall faster than those of galaxies."""
+    drawn, shape = stars(40, seed, shape=(128, 128), apart=2.5), (128, 128)
+    data, (y, x) = image_of((), seed=seed, shape=shape), np.indices(shape)
+    for (a, b), flux, _ in drawn:
+        light = (1 + ((y - a) ** 2 + (x - b) ** 2) / 3.8**2) ** -3.5 * 2.5 / (np.pi * 3.8**2)
+        data += np.array(flux)[:, None, None] * light
+    level = levels.sky_level(looked_at(observed(data, sigma=1.6), sources_of(drawn, PointSource)))
+    assert (np.abs(level.level) < np.maximum(3 * level.error, 0.2 * NOISE)).all()
+
+
 def test_a_rim_below_zero_is_no_light():
     """A galaxy whose wings hide the sky's level everywhere but at the rim."""
     y, x = np.indices((48, 48)) - 23.5
-    wings = 4000 * (4 + y**2 + x**2) ** -1.0
+    wings = 8e4 * (40 + y**2 + x**2) ** -1.5
     o = observed(image_of((), shape=(48, 48)) + wings - wings[0, 24] - 0.6 * NOISE)
     source = (ExtendedSource(position_px=(23.5, 23.5)),)
     level = levels.sky_level(looked_at(o, source))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.inspection import DRAWN, NOISE, image_of, inspected, observed, sources_of
+from helpers.inspection import DRAWN, NOISE, image_of, inspected, observed, sources_of, stars
 
 from clresample.deblending.inspection import noisy_variance
 
@@ -29,6 +29,16 @@ def test_a_variance_of_the_datas_own_counts_is_smoothed_and_fluxes_are_right(sky
         assert (flux < 1 - 1.5 * error).all() if low else (np.abs(flux - 1) < 3 * error).all()
     exact = ((light**2 / expected).sum(axis=(1, 2))) ** -0.5
     assert error == pytest.approx(exact, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_variance_of_a_crowded_image_is_left(seed):
+    """There both rise with the stars' light between all pixels, not with noise."""
+    light = image_of(stars(60, seed), noise=0)
+    variance = NOISE**2 + light / 2
+    data = light + np.random.default_rng(seed).normal(size=light.shape) * variance**0.5
+    given = (observed(data, weights=1 / variance),)
+    assert noisy_variance.with_smooth_variances(given) == (given, [[]])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -45,6 +45,17 @@ def with_photon_noise(drawn, *, gain=0.5, seed=0, psf_sigma=FWHM_SIGMA):
     return observed(data, sigma=psf_sigma, weights=1 / variance)
 
 
+def stars(n, seed, shape=SHAPE, faintest=120.0, ratio=1000.0, apart=2.0):
+    """Stars as in DRAWN at places at least `apart` [px] apart, of evenly distributed ln flux."""
+    rng, places = np.random.default_rng(seed), []
+    while len(places) < n:
+        place = rng.uniform(4, np.array(shape) - 5)
+        if all(np.hypot(*(place - other)) >= apart for other in places):
+            places.append(place)
+    fluxes = faintest * ratio ** rng.uniform(size=n)
+    return tuple((tuple(p), (f, f), 0.0) for p, f in zip(places, fluxes, strict=True))
+
+
 def sources_of(drawn=DRAWN, kind=ExtendedSource):
     return tuple(kind(position_px=place) for place, _, _ in drawn)
 

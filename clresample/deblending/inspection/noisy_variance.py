@@ -21,7 +21,11 @@ WITHIN, WITHIN_SIGMAS = 0.9, 1.645
 # elsewhere, whose noise in images of a few counts would make weights unequal; at least [px].
 NARROW, WIDE, MIN_WIDTH_PX = 0.7, 3.0, 0.7
 LIGHT_SIGMAS = 3.0  # of the narrow mean above the wide one, from which a source is there
-NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+# Differences of a pixel and its neighbours that are 0 of light without second derivatives along y
+# or x. Those from the mean of four hold curved light too: images of 60 stars in 64 pixels, with
+# their right variance, had a line in 8 of 8.
+ROUGHNESS = np.outer([1, -2, 1], [1, -2, 1]) / 6
+AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]) / 8
 
 
 def prepared(observations) -> tuple[tuple, list[list[str]]]:
@@ -77,20 +81,21 @@ def _bias(data, weights):
     if not seen.any() or np.ptp(weights[seen]) <= 1e-6 * weights.max():
         return 0.0
     variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
-    inner = convolve(seen.astype(float), NEIGHBOURS, mode="constant") > 0.99
-    around = convolve(np.where(seen, data, 0.0), NEIGHBOURS, mode="constant")
-    beside = convolve(variance, NEIGHBOURS, mode="constant")
-    inner &= seen
+    inner = seen & (convolve(seen.astype(float), AROUND, mode="constant") > 0.99)
     if np.count_nonzero(inner) < 2 * MIN_PIXELS:
         return 0.0
+    data = np.where(seen, data, 0.0)
+    around = convolve(data, AROUND, mode="constant")
     dark = inner & (around <= np.median(around[inner]))
-    d, v = (data - around)[dark], (variance - beside)[dark]
+    d, v = (convolve(image, ROUGHNESS, mode="constant")[dark] for image in (data, variance))
     kept = np.abs(d) < CLIP * np.quantile(np.abs(d), WITHIN) / WITHIN_SIGMAS
     if np.count_nonzero(kept) < MIN_PIXELS or not v[kept].any():
         return 0.0
     (own, both), (_, other) = np.cov(d[kept], v[kept])
-    bias = both / (1 + 1 / 4) / np.median(beside[dark]) ** 1.5
-    correlated = both > MIN_CORRELATION * np.sqrt(own * other)
+    bias = both / np.median(convolve(variance, AROUND, mode="constant")[dark]) ** 1.5
+    # a right variance follows light, of which d holds what it has more than noise
+    by_light = max(1 - variance[dark].mean() / own, 0)
+    correlated = both**2 > (MIN_CORRELATION**2 + by_light) * own * other
     return float(bias) if correlated and bias > MIN_BIAS else 0.0
 
 
