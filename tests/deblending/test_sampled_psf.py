@@ -7,9 +7,8 @@ from scipy.special import erf
 from clresample.deblending.assessment.cores import core_errors
 from clresample.deblending.batch import deblend
 from clresample.deblending.inspection.star_psfs import StarPSFs
-from clresample.deblending.profiles import ALIAS_PX, GalaxyProfile, StarProfile, draw_psf
+from clresample.deblending.profiles import ALIAS_PX, StarProfile, draw_psf
 from clresample.deblending.sampled_psf import MAX_REACH_PX, reach_px, sampled_psfs
-from clresample.deblending.start.population import is_exact
 from clresample.resampling.resampler import Resampler
 from clresample.sky.frame import Frame, model_psf
 from clresample.sky.grid import Grid
@@ -140,8 +139,29 @@ def test_a_galaxy_beside_a_star_has_its_flux_however_finely_the_psf_is_sampled()
     assert abs(found[0][0] - found[1][0]) < 0.5 * found[0][1]
 
 
-@pytest.mark.parametrize("sampled, exact", [((), True), ((pixel_psf(),), False)])
-def test_stars_are_exact_for_their_neighbours_unless_pixels_alias_them(sampled, exact):
-    home = Frame(GRID, model_psf(0.8))
-    assert is_exact(StarProfile(home, free=True, sampled=sampled)) == exact
-    assert not is_exact(GalaxyProfile(home))
+@pytest.mark.parametrize("away", [(0.0, 0.0), (1.4, -0.9)])
+def test_a_star_on_a_galaxy_leaves_its_light_where_pixels_alias_the_star(away):
+    """A sharp image and a wide one, of a disk of 8 pixels and a star five times as bright."""
+    galsim = pytest.importorskip("galsim")
+    rng, fluxes, found = np.random.default_rng(4), (4000.0, 20000.0), []
+    disk = galsim.Exponential(half_light_radius=0.8).shear(g1=0.2)
+    for scale, n, psf, spacing in (
+        (0.1, 128, galsim.Moffat(3, fwhm=0.16, trunc=1.5), 0.25),
+        (0.2, 64, galsim.Moffat(3.5, fwhm=0.7, trunc=4.0), 1.0),
+    ):
+        psf = galsim.Convolve(psf, galsim.Pixel(scale))
+        star = psf.shift(0.1 * away[1], 0.1 * away[0])
+        light = fluxes[0] * galsim.Convolve(disk, psf) + fluxes[1] * star
+        data = light.drawImage(nx=n, ny=n, scale=scale, method="no_pixel", dtype=float).array
+        side = 4 * round(3.2 / (scale * spacing * 8)) + 1
+        image = psf.drawImage(nx=8 * side + 1, ny=8 * side + 1, scale=scale * spacing,
+                              method="no_pixel", dtype=float).array  # fmt: skip
+        variance = 1 + data / 5
+        data = data + rng.normal(size=data.shape) * variance**0.5
+        given = PSF(image, spacing=spacing), Grid.flat((n, n), scale)
+        found.append(Observation(data, *given, variance=variance, name=f"{scale}"))
+    middle = np.array([63.5, 63.5])
+    sources = [ExtendedSource(position_px=middle), PointSource(position_px=middle + away)]
+    result = deblend(found, sources)
+    for component, flux in zip(result.components, fluxes, strict=True):
+        np.testing.assert_allclose(component.flux, flux, rtol=0.06)

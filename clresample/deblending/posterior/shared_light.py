@@ -38,8 +38,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.box import boxes_meet, intersect_boxes
-from ..profiles import GalaxyProfile
-from ..start.population import contamination_factors, is_exact
+from ..profiles import GalaxyProfile, StarProfile
+from ..start.population import contamination_factors
 from .errors import FluxChanges
 from .profile_modes import SCATTER, SHAPE_MODES
 
@@ -75,7 +75,7 @@ class DoubtedShape:
     @property
     def added_root(self):
         """C^-1 times a root (4, 4) of C' - C."""
-        return self.axes * (np.sqrt(self.doubted - self.variance) / self.variance)
+        return self.axes * (np.sqrt(np.maximum(self.doubted - self.variance, 0)) / self.variance)
 
     @property
     def size_scatter(self):
@@ -131,7 +131,7 @@ def _contamination(posterior):
             shared = block[layout.n_modes[i] + bands, layout.n_modes[j] + bands]
             normal[0, :, i, j] = normal[0, :, j, i] = shared
     spectra = solution.spectra if layout.ties is None else solution.spectra[:, layout.ties.first]
-    stars = np.array([is_exact(shape) for shape in solution.shapes])
+    stars = np.array([isinstance(shape, StarProfile) for shape in solution.shapes])
     source = np.asarray(solution.source)
     return contamination_factors(normal, spectra.T[None], source[None], stars[None])[0]
 

@@ -23,7 +23,7 @@ that of all other sources, an error in M changes the light of u by
     E = NEIGHBOUR_MODEL_ERROR max(0, <u, M> - OWN_LIGHT alike <u, u>) / |u|
 
 in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
-Light of stars in M counts by STAR_MODEL_ERROR, unless pixels alias it. Of two galaxies that are
+Light of stars in M counts by STAR_MODEL_ERROR. Of two galaxies that are
 alike each has its own light in the data, and neither shape is doubted: alike is |u| / |M|, at most
 1, in the mean of M's sources by their light in u.
 The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
@@ -46,7 +46,7 @@ from ..profiles import GalaxyProfile, StarProfile
 # GALAXY_SCATTER from 0.15 to 0.27 and 0.35 to 0.5, or a WEIGHT of 8, change them by up to 0.03 dB;
 # updating the scatter of ellipticities too costs up to 0.1 dB.
 LEARNED = np.array([0, 3])
-SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.5]), np.array([0.2, 0.5]), 4.0
+SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.7]), np.array([0.2, 0.7]), 4.0
 # Smallest number of galaxies in a scene for which the prior is updated.
 MIN_GALAXIES = 2
 # [1] Smallest information of a scene's best known galaxy relative to which others count.
@@ -86,7 +86,7 @@ class PopulationPrior:
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text
     own_light (B, 1): OWN_LIGHT in scenes started from large galaxies, 0 in others
-    galaxies, stars (B, n): bool, of which there are galaxies, and stars that are `is_exact`
+    galaxies, stars (B, n): bool, of which there are galaxies and stars
     """
 
     def __init__(self, shapes, scene, index, n_scenes, n_most, n_parameters):
@@ -98,7 +98,7 @@ class PopulationPrior:
             n = len(shape.mean)
             self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
             self.galaxies[b, i] = isinstance(shape, GalaxyProfile)
-            self.stars[b, i] = is_exact(shape)
+            self.stars[b, i] = isinstance(shape, StarProfile)
             # components of one source differ by more than galaxies
             self._known[b, i] = self.galaxies[b, i] and shape.whole
         self._before = self.mean[..., LEARNED]
@@ -159,16 +159,11 @@ class PopulationPrior:
         self.scatter[at] = scatter[k, i]
 
 
-def is_exact(shape) -> bool:
-    """Returns True for a StarProfile without aliased waves: its error is that of its PSF."""
-    return isinstance(shape, StarProfile) and not shape.sampled
-
-
 def contamination_factors(normal, spectra, source, stars, own_light=OWN_LIGHT):
     """1 + E^2 (k, n) of the components of some scenes; see the module's text.
 
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
-    source (k, n): to which each belongs; stars (k, n): bool, those that are `is_exact`
+    source (k, n): to which each belongs; stars (k, n): bool, those that are stars
     own_light: OWN_LIGHT, or that of each scene (k, 1)
     """
     light = np.einsum("kci,kcij,kcj->kij", spectra, normal, spectra)
