@@ -14,9 +14,13 @@
 #endif
 
 enum { DRAW_NY, DRAW_NX, DRAW_N, DRAW_BEGIN, N_DRAW };
-/* place in the box, C^-1, beta, 1 / (2 pi sqrt(det C)); dC (yy, yx, xx) and 1/2 tr(C^-1 dC) by each
- * of three parameters */
-enum { CY, CX, I_YY, I_YX, I_XX, BETA, NORM, SLOPES, N_SHAPE = SLOPES + 12 };
+/* place in the box, C^-1 / w, s, m, b, b s^m, peak, LIFT: what s adds to the first of the following
+ * as a part of the second, with opposite sign; c_0, c_1, c_2 of SersicProfile.wing_slopes;
+ * w dC (yy, yx, xx) and d ln(sqrt(det C) K) by each of three parameters */
+enum {
+    CY, CX, I_YY, I_YX, I_XX, SOFTNESS, POWER, FALL, REST, PEAK, LIFT, WINGS,
+    SLOPES = WINGS + 3, N_SHAPE = SLOPES + 12
+};
 
 #define DARK ((REAL)1e-20)  /* of the peak; smaller values would be denormals, which are slow */
 
@@ -30,7 +34,7 @@ enum { CY, CX, I_YY, I_YX, I_XX, BETA, NORM, SLOPES, N_SHAPE = SLOPES + 12 };
 #endif
 
 #if ROWS && !defined(USE_DOUBLE)
-/* ln x of 1 <= x < 2^127: x = 2^n m with m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh(s) with
+/* ln x of 2^-126 <= x < 2^127: x = 2^n m, m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh(s) with
  * s = (m - 1) / (m + 1), |s| < 0.172: the truncated series has an error of 2e-9.  Unlike built-in
  * functions, plain arithmetic is vectorised over pixels by compilers for CPUs. */
 static float ln(const float x)
@@ -42,12 +46,12 @@ static float ln(const float x)
     return ((bits >> 23) - 127 + over) * 0.69314718f + 2 * s * series;
 }
 
-/* e^x of x <= 0, 0 where that is below DARK: 2^n e^r with |r| <= ln 2 / 2; the truncated series has
- * an error of 5e-9. */
+/* e^x of |x| <= 60, less is below DARK: 2^n e^r with |r| <= ln 2 / 2; the truncated series has an
+ * error of 5e-9. */
 static float power_of_e(const float x)
 {
-    const float y = x < -60 ? -60 : x;
-    const int n = (int)(y * 1.44269504f - 0.5f);
+    const float y = x < -60 ? -60 : x > 60 ? 60 : x;
+    const int n = (int)(y * 1.44269504f + 127.5f) - 127;
     const float r = (y - n * 0.693359375f) + n * 2.12194440e-4f;   /* the first has 10 bits */
     float sum = 1 + r * (1 / 7.0f);
     sum = 1 + r * (1 / 6.0f) * sum;
@@ -76,23 +80,27 @@ __kernel void draw_profiles(__global const int *restrict table, __global const R
     __global REAL *out = images + t[DRAW_BEGIN] + (size_t)y * nx;
     const size_t one = (size_t)ny * nx;
     const REAL dy = y - p[CY], cx = p[CX], yy = p[I_YY], yx = p[I_YX], xx = p[I_XX];
-    const REAL beta = p[BETA], norm = p[NORM];
+    const REAL soft = p[SOFTNESS], m = p[POWER], b = p[FALL], rest = p[REST], peak = p[PEAK];
+#if K > 1
+    const REAL lift = p[LIFT], c0 = p[WINGS], c1 = p[WINGS + 1], c2 = p[WINGS + 2];
+#endif
     FOR_LANES(x, nx) {
         REAL image[K][LANES];
         for (int k = 0; k < LANES; ++k) {
             const REAL dx = x + k - cx;
             const REAL u = yy * dy + yx * dx, v = yx * dy + xx * dx, q = dy * u + dx * v;
-            const REAL l = LOG(1 + q / (2 * beta)), e = EXP(-(beta + 1) * l);
-            const REAL s0 = e > DARK ? norm * e : 0;
+            const REAL g = soft + q, l = LOG(g), power = EXP(m * l), e = EXP(rest - b * power);
+            const REAL s0 = e > DARK ? peak * e : 0;
             image[0][k] = s0;
 #if K > 1
-            const REAL fall = (beta + 1) / (2 * beta + q);
+            const REAL fall = b * m * power / g;
             for (int i = 0; i < 3; ++i) {
-                const REAL a = p[SLOPES + 4 * i], b = p[SLOPES + 4 * i + 1];
-                const REAL c = p[SLOPES + 4 * i + 2], d = p[SLOPES + 4 * i + 3];
-                image[i + 1][k] = s0 * (fall * (a * u * u + 2 * b * u * v + c * v * v) - d);
+                const REAL cyy = p[SLOPES + 4 * i], cyx = p[SLOPES + 4 * i + 1];
+                const REAL cxx = p[SLOPES + 4 * i + 2], d = p[SLOPES + 4 * i + 3];
+                const REAL by_c = cyy * u * u + 2 * cyx * u * v + cxx * v * v;
+                image[i + 1][k] = s0 * (fall * (by_c + lift * d) - d);
             }
-            image[4][k] = s0 * (q * fall - beta * l);
+            image[4][k] = s0 * (c0 + power * (c1 + c2 * l));
 #endif
         }
         const int many = nx - x < LANES ? nx - x : LANES;

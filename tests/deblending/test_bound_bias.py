@@ -21,7 +21,7 @@ from clresample.measurement.photometry import bounded_fluxes, fluxes
 from clresample.sky.frame import Frame
 from clresample.sky.sources import ExtendedSource, PointSource
 
-N_NOISES, FLUX, NOISE = 32, 300.0, 0.2
+N_NOISES, FLUX, NOISE = 32, 1000.0, 0.2
 
 
 class Matrix:
@@ -95,7 +95,7 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     assert (released < 0).mean() > 0.9
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
     # each is known to 1 / sqrt(32 noises of 3 bands) = 0.1, their difference better
-    assert before > 0.2 and abs(bias) < 0.6 * before, (bias, before)
+    assert before > 0.2 and abs(bias) < 0.7 * before, (bias, before)
 
 
 def test_fluxes_without_light_are_not_biased_by_noise(device):

@@ -262,7 +262,7 @@ def test_many_least_squares_at_once():
 
 def test_galaxies_in_boxes_of_other_sizes_are_drawn_together(device):
     home, place = frame((70, 60)), np.array([33.2, 29.6])
-    thetas = [np.array([np.log(size), 0.2, -0.1, np.log(5)]) for size in (0.5, 3.0)]
+    thetas = [np.array([np.log(size), 0.2, -0.1, np.log(5)]) for size in (0.5, 5.0)]
     chosen = [StartComponent(0, k, k, GalaxyProfile(home), place, home.shape) for k in range(2)]
     boxes = boxes_of(chosen, thetas, np.full(2, 0.01))
     slots = ComponentBatch(chosen, thetas, boxes, slopes=True)

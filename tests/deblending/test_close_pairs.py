@@ -14,7 +14,7 @@ from clresample.deblending.start.profile_fit import ProfileFit
 from clresample.fields.execution.fitting import ROUGH_TOL
 
 FLUX = np.array((3000.0, 2500, 2100))
-SMALL, LARGE = (np.log(1.5), 0, 0, np.log(6.5)), (np.log(7.5), 0.2, -0.1, np.log(5.0))
+SMALL, LARGE = (np.log(1.5), 0, 0, np.log(25.0)), (np.log(7.5), 0.2, -0.1, np.log(20.0))
 SCENES = np.arange(1)
 
 
@@ -57,7 +57,7 @@ def test_each_of_two_galaxies_has_its_own_light(device, spoilt, size):
 
 def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, monkeypatch):
     """One of two faint galaxies may have gained light of the other, by the doubt of the start."""
-    (known,) = deblend_many([pair(0.01)], device=device)
+    (known,) = deblend_many([pair(0.005)], device=device)
     doubt = spoilt[0].flux_doubt.copy()
     assert (np.abs(doubt[..., 0]).sum(axis=1) > 0.3 * spoilt[0].looking.spectra.sum(axis=1)).all()
     held = np.abs(doubt[:, 0, 2])  # by the end with one shape held
@@ -70,8 +70,8 @@ def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, mo
         fit.flux_doubt[:] = 0
 
     monkeypatch.setattr(ProfileFit, "run", without)
-    (other,) = deblend_many([pair(0.01)], device=device)
-    unit = Fit(pair(0.01), Settings(), device, np.float32, pad=1).unit
+    (other,) = deblend_many([pair(0.005)], device=device)
+    unit = Fit(pair(0.005), Settings(), device, np.float32, pad=1).unit
     changes = np.moveaxis(doubt, 1, 0) * unit[:, None, None]
     added = known.errors.flux - other.errors.flux
     np.testing.assert_allclose(added, changes @ changes.swapaxes(1, 2), rtol=1e-3)

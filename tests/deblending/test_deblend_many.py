@@ -11,7 +11,7 @@ from helpers.tuning import tune
 
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
-from clresample.deblending.fit import Fit, start_fits
+from clresample.deblending.fit import Fit, scene_bytes, start_fits
 from clresample.deblending.result import Result
 from clresample.paper import run as paper_run
 from clresample.paper.run import FitTrack
@@ -155,10 +155,10 @@ def test_a_memory_budget_splits_groups(device, monkeypatch):
     settings = replace(SETTINGS, max_iter=5)
     together = deblend_many(blends, settings=settings, device=device)
     assert engines == [4]
-    first = Fit(blends[0], settings, device, np.float32, pad=1)
-    start_fits([first])
-    one = first.scene.n_bytes
-    for memory, sizes in ((1, [1] * 4), (2.5 * one, [2, 2]), (10 * one, [4])):
+    fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends]
+    start_fits(fits)
+    one = max(map(scene_bytes, fits))
+    for memory, sizes in ((1, [1] * 4), (2.9 * one, [2, 2]), (10 * one, [4])):
         engines.clear()
         results = deblend_many(blends, settings=settings, device=device, memory=memory)
         assert engines == sizes
@@ -176,7 +176,7 @@ def test_the_budget_counts_what_a_scene_takes(device):
     running.engine.run(1)
     gc.collect()
     used, counted = device.in_use - before, sum(f.scene.n_bytes for f in fits)
-    assert 0.4 * counted < used < 0.6 * counted
+    assert 0.4 * counted < used < 0.7 * counted
 
 
 @pytest.mark.counts_memory

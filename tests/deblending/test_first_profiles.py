@@ -126,7 +126,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
         measured.append((kept, fit.chi2[scenes]))
 
     monkeypatch.setattr(profile_fit, "_run_without_doubt", noted)
-    sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0), ((44.0, 40.0), (900, 800, 700), 1.5)], spoilt)
+    sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0), ((44.0, 40.0), (9e3, 8e3, 7e3), 1.5)], spoilt)
     ((kept, again),) = measured
     assert len(kept)
     np.testing.assert_allclose(kept, again, rtol=1e-5)

@@ -321,5 +321,5 @@ def test_matrices_and_transforms_give_the_same_coefficients(monkeypatch):
     by_matrices = coefficients_of(prior, profile, wanted, strengths, window)[1]
     monkeypatch.setattr(scale_direction, "MAX_MATRIX_SIDE", 0)
     by_transforms = coefficients_of(prior, profile, wanted, strengths, window)[1]
-    assert np.abs(by_matrices - by_transforms).max() < 1e-4 * np.abs(by_transforms).max()
+    assert np.abs(by_matrices - by_transforms).max() < 2e-4 * np.abs(by_transforms).max()
     assert np.abs(by_matrices - wanted).max() < 0.1 * wanted.max()

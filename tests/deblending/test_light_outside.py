@@ -61,7 +61,7 @@ def galaxy(sigma_px, *, wings=6.0, frame=(61, 61)):
     seen = observe(grid, ("g", "r"), weights=1e-12)
     covariance = np.full((2, 1, 1), 1e-4)
     result = blend([part], observations=(seen,), grid=grid, covariance=covariance)
-    return result, ([shape], [theta], [at], np.ones(1)), 1 - image.sum()
+    return result, ([shape], [theta], [at], np.ones(1)), max(1 - image.sum(), 0)
 
 
 def errors_of(result, sigma):

@@ -4,8 +4,18 @@ from math import erf
 
 import numpy as np
 import pytest
+from astropy.modeling.models import Sersic1D
 
-from clresample.deblending.profiles import covariance, draw_psf, profile, psf_second_moment
+from clresample.deblending.profiles import (
+    BETA_0,
+    HALF_LIGHT,
+    SHARP,
+    SersicProfile,
+    covariance,
+    draw_psf,
+    profile,
+    psf_second_moment,
+)
 from clresample.sky.psf import PSF
 
 SHAPE = (41, 46)
@@ -105,6 +115,41 @@ def test_a_galaxy_is_what_its_parameters_say(position):
     root = np.sqrt(1 + 0.4**2 + 0.2**2)
     own = 9 * np.array([[1 + 0.4 / root, -0.2 / root], [-0.2 / root, 1 - 0.4 / root]])
     np.testing.assert_allclose(c - psf_second_moment(STAR), own, rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [0.5, 1.0, 2.5, 4.0])
+def test_a_galaxy_far_larger_than_the_psf_is_sersics(n):
+    """By the function that astropy has of it, of the same effective radius, and its light."""
+    re_px, shape = 40.0, (161, 171)
+    ln_beta = np.log(min(1 / max(n - 0.5, 1e-9), 1e9) - BETA_0)
+    at = np.array([np.log(re_px / HALF_LIGHT**0.5), 0, 0, ln_beta])
+    drawn = profile(at, (80.0, 85.0), shape, 1e-12 * np.eye(2), slopes=False)[0]
+    radius = np.hypot(*(np.indices(shape) - np.array([80.0, 85.0])[:, None, None]))
+    wanted = Sersic1D(amplitude=1, r_eff=re_px, n=n)(radius)
+    away = radius > re_px * 20 * SHARP**0.5  # of the middle, which SHARP rounds
+    ratio = drawn[away] / wanted[away]
+    # b(n) is 1 % too small at n = 0.5, 0.1 % at n = 1
+    assert np.ptp(ratio) < (0.06 if n == 0.5 else 0.02) * ratio.mean()
+    one = SersicProfile(at, 1e-12 * np.eye(2))
+    assert one.outside(HALF_LIGHT) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("beta", [0.1, 2.0, 25.0])
+def test_light_outside_an_ellipse_is_that_of_the_pixels_there(beta):
+    """And lies beyond the level of brightness that is given for it."""
+    theta, c_psf = np.array([np.log(4.0), 0.3, -0.2, np.log(beta)]), psf_second_moment(STAR)
+    place, shape = (100.3, 99.6), (200, 200)
+    image = profile(theta, place, shape, c_psf, slopes=False)[0]
+    c = covariance(theta, c_psf)[0]
+    one, away = SersicProfile(theta, c_psf, c), np.indices(shape) - np.reshape(place, (2, 1, 1))
+    q = np.einsum("iyx,ij,jyx->yx", away, np.linalg.inv(c), away)
+    assert image[q < 0.2].max() == pytest.approx(one.peak, rel=0.15)
+    for part in (0.5, 0.2):
+        level = one.threshold(part)
+        end = one.reach(level)
+        assert one.outside(end) == pytest.approx(part, rel=1e-6)
+        assert 1 - image[q < end].sum() == pytest.approx(part, abs=0.01)
+        assert image[q < end].min() == pytest.approx(level * one.peak, rel=0.05)
 
 
 def test_moments_of_a_psf():

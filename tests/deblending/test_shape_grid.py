@@ -83,20 +83,20 @@ def test_gains_are_differences_of_chi2(fitted, monkeypatch, n, fit_sky):
 
 def test_neighbours_stay_as_they_are(fitted):
     """The gain of a profile is of the data without the other source, in the order of the list."""
-    image, kept = galaxy(2.5, 6.0, 20) + galaxy(1.5, 6.0, 60, PLACES[1]), []
+    image, kept = galaxy(2.5, 20.0, 20) + galaxy(1.5, 20.0, 60, PLACES[1]), []
 
     def looked(fit, scenes):
         kept.append(shape_grid._grids(fit, [1, 0][-len(fit.counts) :]))
 
     fitted(image, PLACES[::-1], looked=looked)
-    fitted(galaxy(2.5, 6.0, 20), looked=looked)
+    fitted(galaxy(2.5, 20.0, 20), looked=looked)
     both, alone = kept[0], kept[1][0]
     assert list(both) == [1, 0] and [both[i].index for i in both] == [1, 0]
     np.testing.assert_allclose(both[1].gain.max(), alone.gain.max(), rtol=0.03)
     np.testing.assert_allclose(both[1].flux[0], alone.flux[0], rtol=0.03)
 
 
-@pytest.mark.parametrize("beta, wide", [(0.5, True), (6.5, False)])
+@pytest.mark.parametrize("beta, wide", [(0.5, True), (25.0, False)])
 def test_wings_are_found_where_the_data_have_them(fitted, beta, wide):
     """At signal to noise 14, where steps from no wings end at none."""
     (fit,), _ = fitted(galaxy(2.5, beta, 14))
@@ -106,7 +106,7 @@ def test_wings_are_found_where_the_data_have_them(fitted, beta, wide):
 def test_a_large_galaxy_without_light_in_a_small_profile_is_found(fitted):
     """Ten times the expected size, at signal to noise 14."""
     middle = (SIDE_PX / 2, SIDE_PX / 2)
-    image = galaxy(25.0, 6.0, 14, middle, (SIDE_PX, SIDE_PX))
+    image = galaxy(25.0, 20.0, 14, middle, (SIDE_PX, SIDE_PX))
     (fit,), result = fitted(image, [middle], fit_shifts=False)
     assert np.exp(fit.theta[0, 0, 0]) > 15
     error = np.sqrt(result.errors.flux[0, 0, 0])
@@ -152,7 +152,7 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
         before.append(fit.theta.copy())
         shape_grid.fit_faint_shapes(fit, scenes)
 
-    (fit,), _ = fitted(galaxy(2.5, 6.5, 3), looked=looked)
+    (fit,), _ = fitted(galaxy(2.5, 25.0, 3), looked=looked)
     np.testing.assert_array_equal(fit.theta, before[0])
     assert fit.flux_estimate[0, 1, 0] > 1
 
@@ -160,7 +160,7 @@ def test_a_galaxy_without_significant_light_stays_and_its_error_holds_the_scatte
 def test_fluxes_and_errors_hold_larger_profiles_of_a_galaxy_without_significant_light(fitted):
     """Ten times the expected size, at signal to noise 4.5: none is significant."""
     middle = (SIDE_PX / 2, SIDE_PX / 2)
-    image = galaxy(25.0, 6.0, 4.5, middle, (SIDE_PX, SIDE_PX))
+    image = galaxy(25.0, 20.0, 4.5, middle, (SIDE_PX, SIDE_PX))
     (fit,), result = fitted(image, [middle], fit_shifts=False)
     assert np.exp(fit.theta[0, 0, 0]) < 5
     flux, variance = (float(found.squeeze()) for found in fluxes(result))

@@ -86,7 +86,7 @@ def test_a_doubted_profile_is_compared_with_the_ring_around_it():
         grid=SimpleNamespace(pixel_scale_arcsec=0.25), shape=(201, 201), psf=PSF.gaussian(1.0)
     )
     shape, place = GalaxyProfile(frame), np.array([100.0, 100.0])
-    thetas = [np.array([size, 0, 0, 1.5]) for size in (0.3, 0.3 + SIZE_SCATTER, 3.5)]
+    thetas = [np.array([size, 0, 0, 4.0]) for size in (0.3, 0.3 + SIZE_SCATTER, 3.5)]
     small, larger, wide = (shape.draw(theta, place)[0] for theta in thetas)
     box = np.s_[92:109, 92:109]
     core = (small * larger)[box].sum() / np.square(small[box]).sum()

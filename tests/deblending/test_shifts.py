@@ -108,7 +108,7 @@ def test_what_agrees_is_fitted_as_without_shifts(device):
 
 def test_batches_find_the_shifts_of_single_fits(device):
     blends = [blend(shift, seed=i) for i, shift in enumerate([(0.5, 0.5), (-1, 1), (2, 0)])]
-    settings = Settings(fit_shifts=True, max_iter=60)
+    settings = Settings(fit_shifts=True, max_iter=200)
     together = deblend_many(blends, settings=settings, device=device)
     for b, result in zip(blends, together, strict=True):
         alone = deblend(b.observations, b.sources, frame=b.frame, settings=settings, device=device)

@@ -34,7 +34,7 @@ def truth(objects, shape=SHAPE):
     model = np.zeros((3, *shape))
     for position, flux, sigma in objects:
         if sigma:
-            parameters = np.array([np.log(sigma), 0.2, -0.1, np.log(5.0)])
+            parameters = np.array([np.log(sigma), 0.2, -0.1, np.log(20.0)])
             image = profile(parameters, position, shape, psf_second_moment(MODEL_PSF))[0]
         else:
             image = draw_psf(MODEL_PSF, position, shape)[0]

@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.mapping import on_wide_pixels
-from ..profiles import GalaxyProfile, covariance, galaxy_reach, wave_light
+from ..profiles import (
+    HALF_LIGHT,
+    GalaxyProfile,
+    SersicProfile,
+    covariance,
+    galaxy_reach,
+    wave_light,
+)
 
 # [px] Sides of boxes. There are few sizes, since each needs an operator, and components in boxes of
 # one size are rendered together. With more sizes, scenes with different pixel grids take a quarter
@@ -90,7 +97,7 @@ def peaks_of(components, thetas):
     out, smooth = np.zeros(len(components)), _galaxies(components)
     if smooth.any():
         theta, moment = _stacked(components, thetas, smooth)
-        out[smooth] = 1 / (2 * np.pi * np.sqrt(np.linalg.det(covariance(theta, moment)[0])))
+        out[smooth] = SersicProfile(theta, moment).peak
     for i in np.flatnonzero(~smooth):
         out[i] = components[i].shape.peak
     return out
@@ -232,12 +239,20 @@ class ComponentBatch:
 def _shapes(theta, place, moment):
     """Parameters of galaxies for kernels/draw.cl: (n, N_SHAPE)."""
     c, slopes = covariance(theta, moment)
-    inverse = np.linalg.inv(c)
+    radial, inverse = SersicProfile(theta, moment, c), np.linalg.inv(c)
     traces = np.einsum("nij,nkji->nk", inverse, slopes) / 2
-    by = np.stack([slopes[..., 0, 0], slopes[..., 0, 1], slopes[..., 1, 1], traces], axis=-1)
-    norm = 1 / (2 * np.pi * np.sqrt(np.linalg.det(c)))
-    head = [*place.T, inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1], np.exp(theta[:, 3])]
-    return np.column_stack([*head, norm, by.reshape(len(theta), -1)])
+    inside = 1 + radial.soft / radial.light
+    by = np.stack(
+        [
+            *HALF_LIGHT * slopes[..., [0, 0, 1], [0, 1, 1]].transpose(2, 0, 1),
+            traces * inside[:, None],
+        ],
+        axis=-1,
+    )
+    inverse = inverse / HALF_LIGHT
+    head = [*place.T, inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]]
+    head += [radial.s, radial.m, radial.b, radial.rest, radial.peak, radial.soft / inside]
+    return np.column_stack([*head, *radial.wing_slopes(), by.reshape(len(theta), -1)])
 
 
 def listed_by_scene(of_slots, scenes):

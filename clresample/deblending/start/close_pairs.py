@@ -19,14 +19,14 @@ import numpy as np
 from scipy.special import expit
 
 from ..linear.spectra import portions
-from ..profiles import GalaxyProfile, galaxy_reach
+from ..profiles import GalaxyProfile, covariance
 from .first_profiles import NEED
 from .shape_grid import part_inside
 
-# A close pair's largest distance, in units of the larger one's radius, and the smallest ratio of
-# the two radii, at which profiles fall to this fraction of their peak. Of 120 galaxies in pairs
-# none is silently wrong (bench.ladder, close, seed 52525); of 200 without further starts 18 are.
-MAX_AWAY, MIN_RATIO, RADIUS_LEVEL = 0.5, 1.5, 0.1
+# A close pair's largest distance, in units of the larger one's radius, the root of C, and the
+# smallest ratio of the two radii. Of 120 galaxies in pairs none is silently wrong (bench.ladder,
+# close, seed 52525); of 200 without further starts 18 are.
+MAX_AWAY, MIN_RATIO = 1.1, 1.5
 N_ENDS = 3  # before, of both profiles, with one of them held
 # Side of the windows in which pairs are fitted, in that of their light before, which may widen.
 MARGIN = 1.5
@@ -141,7 +141,8 @@ def _larger_neighbours(fit, b):
     if len(at) < 2:
         return []
     moments = np.array([components[i].shape.psf_moment for i in at])
-    radius = galaxy_reach(np.array([theta[i] for i in at]), moments, np.full(len(at), RADIUS_LEVEL))
+    c = covariance(np.array([theta[i] for i in at]), moments)[0]
+    radius = np.sqrt(np.diagonal(c, axis1=1, axis2=2))
     place = np.array([components[i].position for i in at])
     away = np.linalg.norm((place[:, None] - place) / radius, axis=2)  # of the second one's radii
     size = np.sqrt(radius.prod(axis=1))

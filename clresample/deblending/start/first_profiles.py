@@ -36,11 +36,6 @@ NEED = 25.0
 # Largest number of steps after each large profile that is added, before all are fitted together:
 # these end where they gain less than NEED, as smaller differences do not choose profiles.
 N_FIRST_STEPS = 5
-# Smallest beta of large profiles in these steps, of a Sersic profile of n = 4: with smaller ones a
-# galaxy takes the light of neighbours that are not there yet into its wings, and may keep it. Two
-# of 23 pairs of equals ended there if a third source was far away (fluxes moved by 0.7 and 0.8
-# errors; bench.ladder, pair, seed 41901).
-FIRST_BETA = 0.1
 
 
 def profile_grid(looking, scenes, thetas, error) -> dict:
@@ -120,7 +115,6 @@ def _fit_part(fit, thetas, free, scenes):
     for b, k, i in zip(*part.at, here, strict=True):
         part.theta[b, k, : len(thetas[i])] = thetas[i]
         part.moves[b, k] = i in free
-    part.least_ln_beta = np.log(FIRST_BETA)
     part._take(scenes)
     part._step(scenes, N_FIRST_STEPS, NEED)
     return thetas | dict(zip(here, part.thetas(), strict=True))

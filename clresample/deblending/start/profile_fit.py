@@ -45,7 +45,6 @@ class ProfileFit:
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
-    least_ln_beta: smallest ln beta that steps reach
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
         is common to all channels, and that of each band, see shape_grid.py; 0 for others
@@ -69,7 +68,7 @@ class ProfileFit:
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
-        self.moves, self.least_ln_beta = np.ones(size[:2], bool), -np.inf
+        self.moves = np.ones(size[:2], bool)
 
     def thetas(self, theta=None):
         """Parameters (n,) of each component."""
@@ -148,7 +147,6 @@ class ProfileFit:
             scenes = np.flatnonzero(live)
             given = *self._equations(scenes), self.population.galaxies[scenes], self.moves[scenes]
             trial, expected, promised = steps.next(scenes, *given)
-            trial[..., 3] = np.maximum(trial[..., 3], self.least_ln_beta)
             on = expected >= tol
             live[scenes[~on]] = False
             scenes = scenes[on]

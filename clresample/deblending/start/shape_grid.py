@@ -37,7 +37,7 @@ import numpy as np
 
 from ..linear.component_batch import peaks_of, renumbered
 from ..linear.spectra import MODEL_ERROR
-from ..profiles import GalaxyProfile
+from ..profiles import GalaxyProfile, SersicProfile, covariance
 from .first_profiles import NEED
 from .population import LEARNED
 
@@ -244,9 +244,11 @@ def _products(around, present, owner, first):
 def part_inside(components, theta):
     """Fractions (n,) of the light of galaxies inside their frames, as if these were round."""
     half = np.array([min(c.frame) for c in components]) / 2
-    psf = np.array([np.trace(c.shape.psf_moment) for c in components]) / 2
-    beta, width = np.exp(theta[:, 3]), np.exp(2 * theta[:, 0]) + psf
-    return 1 - (1 + half**2 / width / (2 * beta)) ** -beta
+    moment = np.array([c.shape.psf_moment for c in components])
+    theta = theta * [1, 0, 0, 1]
+    c = covariance(theta, moment)[0]
+    width = np.trace(c, axis1=1, axis2=2) / 2
+    return 1 - SersicProfile(theta, moment, c).outside(half**2 / width)
 
 
 def _fitted_again(fit, better):
