@@ -232,7 +232,7 @@ def test_how_far_profiles_and_places_may_be_off():
     home, position = scenes.frame(), np.array([10.0, 11.0])
     galaxy, star, box = GalaxyProfile(home), StarProfile(home, free=True), np.ones((9, 9))
     kinds = [
-        (galaxy, galaxy.mean, [0.4, 0.26, 0.26, 1.0, 0.1, 0.1]),
+        (galaxy, galaxy.mean, [0.4, 0.26, 0.26, 2.5, 0.1, 0.1]),
         (FixedProfile(box), np.zeros(0), [0.1, 0.1]),
     ]
     for shape, theta, wanted in kinds:
