@@ -34,7 +34,7 @@ def test_scenes_learn_what_their_galaxies_have_in_common():
     """Of 500 scenes of twelve galaxies, drawn from the model, the mean and scatter are found, and
     galaxies are known better than by what is expected of any: as well as by the true two."""
     rng = np.random.default_rng(1)
-    n_scenes, n, noise = 500, 12, np.array([0.4, 0.56])
+    n_scenes, n, noise = 500, 12, np.array([0.4, 0.85])
     true = rng.normal(0, SCENE_SCATTER, (n_scenes, 2))
     theta = true[:, None] + GALAXY_SCATTER * rng.standard_normal((n_scenes, n, 2))
     data = theta + noise * rng.normal(size=theta.shape)

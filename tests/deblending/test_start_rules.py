@@ -146,14 +146,14 @@ def test_images_are_cut_to_boxes():
     assert fixed().draw(None, None).sum() == 1 and fixed().peak == 1
 
 
-SCATTER = [0.4, 0.17, 0.17, 1.0]
+SCATTER = [0.4, 0.17, 0.17, 1.5]
 
 
 @pytest.mark.parametrize(
     "shape, mean, scatter",
-    [  # 0.25" on pixels of 0.1", round, wings of 25; of two components, a factor e apart
-        (galaxy, [np.log(2.5), 0, 0, np.log(25)], SCATTER),
-        (lambda: galaxy(1, 2, widened=6), [np.log(15) + 0.5, 0, 0, np.log(25)], SCATTER),
+    [  # 0.25" on pixels of 0.1", round, wings of 12; of two components, a factor e apart
+        (galaxy, [np.log(2.5), 0, 0, np.log(12)], SCATTER),
+        (lambda: galaxy(1, 2, widened=6), [np.log(15) + 0.5, 0, 0, np.log(12)], SCATTER),
         (star, [0, 0], [0.5, 0.5]),  # half a pixel about its position
         (lambda: star(free=False), [], []),
     ],

@@ -9,8 +9,8 @@ from ..profiles import SIZE_SCATTER, GalaxyProfile, SersicProfile, StarProfile
 from .moments import light_sums
 
 # Scatter of galaxies in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, for errors: n = 1 is
-# 2.6 from the expected ln beta. The prior of fits is narrower, which gives better models of faint
-# galaxies. With its 1.0 sizes of simulated galaxies would lie within their errors by 0.02 (joint)
+# 1.9 from the expected ln beta. The prior of fits is narrower, which gives better models of faint
+# galaxies. With 1.0 for ln beta sizes of simulated galaxies lie within their errors by 0.02 (joint)
 # to 0.03 (Euclid) less often.
 SCATTER = np.array([SIZE_SCATTER, 0.26, 0.26, 2.5])
 # [px] Scatter of a catalogue's position. With 0.5 the errors of faint sources' positions are larger

@@ -46,7 +46,7 @@ from ..profiles import GalaxyProfile, StarProfile
 # GALAXY_SCATTER from 0.15 to 0.27 and 0.35 to 0.5, or a WEIGHT of 8, change them by up to 0.03 dB;
 # updating the scatter of ellipticities too costs up to 0.1 dB.
 LEARNED = np.array([0, 3])
-SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.7]), np.array([0.2, 0.7]), 4.0
+SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 1.06]), np.array([0.2, 1.06]), 4.0
 # Smallest number of galaxies in a scene for which the prior is updated.
 MIN_GALAXIES = 2
 # [1] Smallest information of a scene's best known galaxy relative to which others count.
