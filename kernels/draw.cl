@@ -14,9 +14,9 @@
 #endif
 
 enum { DRAW_NY, DRAW_NX, DRAW_N, DRAW_BEGIN, N_DRAW };
-/* place in the box, C^-1 / w, s, m, b, b s^m, peak, LIFT: what s adds to the first of the following
- * as a part of the second, with opposite sign; c_0, c_1, c_2 of SersicProfile.wing_slopes;
- * w dC (yy, yx, xx) and d ln(sqrt(det C) K) by each of three parameters */
+/* place in the box, C^-1 / w, s, m, b, b s^m, peak; c_0, c_1, c_2 of SersicProfile.wing_slopes; by
+ * each of three parameters w dC (yy, yx, xx) and d ln(sqrt(det C) K). s falls as sqrt(det C) grows:
+ * LIFT times the latter is by how much that changes q / w + s, with opposite sign */
 enum {
     CY, CX, I_YY, I_YX, I_XX, SOFTNESS, POWER, FALL, REST, PEAK, LIFT, WINGS,
     SLOPES = WINGS + 3, N_SHAPE = SLOPES + 12

@@ -135,8 +135,7 @@ class SersicProfile:
         step = 1e-5 * self.n
         light = (self._log_light(self.n + step) - self._log_light(self.n - step)) / (2 * step)
         by_p, by_log = -self._slope, 2 * self.b * self.m**2
-        p = self.s**self.m
-        constant = -light - p * (by_p + by_log * np.log(self.s))
+        constant = -light - self.rest / self.b * (by_p + by_log * np.log(self.s))
         return -self.by_beta * np.stack([constant, by_p, by_log])
 
     def reach(self, threshold):

@@ -23,9 +23,9 @@ that of all other sources, an error in M changes the light of u by
     E = NEIGHBOUR_MODEL_ERROR max(0, <u, M> - OWN_LIGHT alike <u, u>) / |u|
 
 in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
-Light of stars in M counts by STAR_MODEL_ERROR. Of two galaxies that are
-alike each has its own light in the data, and neither shape is doubted: alike is |u| / |M|, at most
-1, in the mean of M's sources by their light in u.
+Light of stars in M counts by STAR_MODEL_ERROR. Of two galaxies that are alike each has its own
+light in the data, and neither shape is doubted: alike is |u| / |M|, at most 1, in the mean of M's
+sources by their light in u.
 The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
 its neighbours' shapes unchanged. A faint galaxy beside a bright one then has the expected shape;
 the bright one's own data outweigh the prior. Stars have no shape, and their positions are fixed by
@@ -163,7 +163,7 @@ def contamination_factors(normal, spectra, source, stars, own_light=OWN_LIGHT):
     """1 + E^2 (k, n) of the components of some scenes; see the module's text.
 
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
-    source (k, n): to which each belongs; stars (k, n): bool, those that are stars
+    source (k, n): to which each belongs; stars (k, n): bool, which of them are stars
     own_light: OWN_LIGHT, or that of each scene (k, 1)
     """
     light = np.einsum("kci,kcij,kcj->kij", spectra, normal, spectra)
