@@ -12,17 +12,16 @@
 #ifndef K           /* images of a slot: 1, or 5 with slopes */
 #define K 1
 #endif
+#ifndef N_GAUSSIANS /* of a profile */
+#define N_GAUSSIANS 12
+#endif
 
 enum { DRAW_NY, DRAW_NX, DRAW_N, DRAW_BEGIN, N_DRAW };
-/* place in the box, C^-1 / w, s, m, b, b s^m, peak; c_0, c_1, c_2 of SersicProfile.wing_slopes; by
- * each of three parameters w dC (yy, yx, xx) and d ln(sqrt(det C) K). s falls as sqrt(det C) grows:
- * LIFT times the latter is by how much that changes q / w + s, with opposite sign */
-enum {
-    CY, CX, I_YY, I_YX, I_XX, SOFTNESS, POWER, FALL, REST, PEAK, LIFT, WINGS,
-    SLOPES = WINGS + 3, N_SHAPE = SLOPES + 12
-};
-
-#define DARK ((REAL)1e-20)  /* of the peak; smaller values would be denormals, which are slow */
+/* place in the box; of each Gaussian, e = exp(-(yy y^2 + yx y x + xx x^2)), yy, yx, xx, its peak,
+ * and if there are slopes its factors in each: of e y^2, e y x, e x^2 and e */
+enum { CY, CX, FIRST };
+enum { YY, YX, XX, PEAK, SLOPES, N_GAUSSIAN = SLOPES + 4 * (K - 1) };
+#define N_SHAPE (FIRST + N_GAUSSIANS * N_GAUSSIAN)
 
 /* Pixels of a row that are drawn side by side, and a loop over the first of each. */
 #if ROWS
@@ -34,23 +33,12 @@ enum {
 #endif
 
 #if ROWS && !defined(USE_DOUBLE)
-/* ln x of 2^-126 <= x < 2^127: x = 2^n m, m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh(s) with
- * s = (m - 1) / (m + 1), |s| < 0.172: the truncated series has an error of 2e-9.  Unlike built-in
- * functions, plain arithmetic is vectorised over pixels by compilers for CPUs. */
-static float ln(const float x)
-{
-    const int bits = as_int(x), over = (bits & 0x7fffff) > 0x3504f3;    /* m of sqrt(2) */
-    const float m = as_float((bits & 0x7fffff) | (over ? 0x3f000000 : 0x3f800000));
-    const float s = (m - 1) / (m + 1), t = s * s;
-    const float series = 1 + t * (1 / 3.0f + t * (1 / 5.0f + t * (1 / 7.0f + t * (1 / 9.0f))));
-    return ((bits >> 23) - 127 + over) * 0.69314718f + 2 * s * series;
-}
-
-/* e^x of |x| <= 60, less is below DARK: 2^n e^r with |r| <= ln 2 / 2; the truncated series has an
- * error of 5e-9. */
+/* e^x of x >= -60, else e^-60: 2^n e^r with |r| <= ln 2 / 2; the truncated series has an error of
+ * 5e-9.  Unlike the built-in function, plain arithmetic is vectorised over pixels by compilers for
+ * CPUs. */
 static float power_of_e(const float x)
 {
-    const float y = x < -60 ? -60 : x > 60 ? 60 : x;
+    const float y = x < -60 ? -60 : x;
     const int n = (int)(y * 1.44269504f + 127.5f) - 127;
     const float r = (y - n * 0.693359375f) + n * 2.12194440e-4f;   /* the first has 10 bits */
     float sum = 1 + r * (1 / 7.0f);
@@ -62,12 +50,11 @@ static float power_of_e(const float x)
     sum = 1 + r * sum;
     return as_float((n + 127) << 23) * sum;
 }
-#define LOG ln
 #define EXP power_of_e
 #else
-#define LOG log
 #define EXP exp
 #endif
+#define NO_LIGHT 46     /* e^-46, 1e-20, is none; far smaller ones would be denormal, and slow */
 
 __kernel void draw_profiles(__global const int *restrict table, __global const REAL *restrict shape,
                    __global REAL *restrict images)
@@ -79,29 +66,29 @@ __kernel void draw_profiles(__global const int *restrict table, __global const R
     __global const REAL *p = shape + N_SHAPE * (size_t)s;
     __global REAL *out = images + t[DRAW_BEGIN] + (size_t)y * nx;
     const size_t one = (size_t)ny * nx;
-    const REAL dy = y - p[CY], cx = p[CX], yy = p[I_YY], yx = p[I_YX], xx = p[I_XX];
-    const REAL soft = p[SOFTNESS], m = p[POWER], b = p[FALL], rest = p[REST], peak = p[PEAK];
-#if K > 1
-    const REAL lift = p[LIFT], c0 = p[WINGS], c1 = p[WINGS + 1], c2 = p[WINGS + 2];
-#endif
+    const REAL dy = y - p[CY], cx = p[CX];
     FOR_LANES(x, nx) {
         REAL image[K][LANES];
-        for (int k = 0; k < LANES; ++k) {
-            const REAL dx = x + k - cx;
-            const REAL u = yy * dy + yx * dx, v = yx * dy + xx * dx, q = dy * u + dx * v;
-            const REAL g = soft + q, l = LOG(g), power = EXP(m * l), e = EXP(rest - b * power);
-            const REAL s0 = e > DARK ? peak * e : 0;
-            image[0][k] = s0;
-#if K > 1
-            const REAL fall = b * m * power / g;
-            for (int i = 0; i < 3; ++i) {
-                const REAL cyy = p[SLOPES + 4 * i], cyx = p[SLOPES + 4 * i + 1];
-                const REAL cxx = p[SLOPES + 4 * i + 2], d = p[SLOPES + 4 * i + 3];
-                const REAL by_c = cyy * u * u + 2 * cyx * u * v + cxx * v * v;
-                image[i + 1][k] = s0 * (fall * (by_c + lift * d) - d);
+        for (int i = 0; i < K; ++i)
+            for (int k = 0; k < LANES; ++k) image[i][k] = 0;
+        for (int j = 0; j < N_GAUSSIANS; ++j) {
+            __global const REAL *g = p + FIRST + N_GAUSSIAN * j;
+            const REAL yy = g[YY] * dy * dy, yx = g[YX] * dy, xx = g[XX];
+            REAL e[LANES];
+            for (int k = 0; k < LANES; ++k) {
+                const REAL dx = x + k - cx;
+                const REAL q = yy + dx * (yx + xx * dx);
+                e[k] = q < NO_LIGHT ? EXP(-q) : 0;
+                image[0][k] += g[PEAK] * e[k];
             }
-            image[4][k] = s0 * (c0 + power * (c1 + c2 * l));
-#endif
+            for (int i = 1; i < K; ++i) {
+                __global const REAL *f = g + SLOPES + 4 * (i - 1);
+                const REAL none = f[0] * dy * dy + f[3], one = f[1] * dy, two = f[2];
+                for (int k = 0; k < LANES; ++k) {
+                    const REAL dx = x + k - cx;
+                    image[i][k] += e[k] * (none + dx * (one + two * dx));
+                }
+            }
         }
         const int many = nx - x < LANES ? nx - x : LANES;
         for (int i = 0; i < n; ++i)

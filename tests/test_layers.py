@@ -42,7 +42,10 @@ ALLOWED_IMPORTS = {
 }
 # Packages of deblending that know nothing of the fits around them, and what they import of it.
 DEBLENDING = "clresample.deblending."
-INNER_IMPORTS = {"linear.": ("component_images", "profiles", "view"), "solver.": ("linear.",)}
+INNER_IMPORTS = {
+    "linear.": ("component_images", "profiles", "sersic", "view"),
+    "solver.": ("linear.",),
+}
 # Packages that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
 # Over a limit the test fails; over what is enough for nearly all it warns.

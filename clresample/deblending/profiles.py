@@ -21,12 +21,12 @@ import functools
 
 import numpy as np
 from scipy import ndimage
-from scipy.special import gammaincc, gammainccinv, gammaln, j0
 
 from ..sky.box import box_slices
 from ..sky.psf import PSF
 from ..sky.sources import ExtendedSource, PointSource
 from .sampled_psf import alias_tables, reach_px
+from .sersic import gaussians
 
 # Number of cached OTFs of model PSFs: the stars of a frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
@@ -58,6 +58,10 @@ BETA_0 = 0.13
 SHARP, SOFT = 5e-4, 1.5
 # Nodes of the quadrature of `wave_light`.
 N_NODES = 192
+# Exponent of a Gaussian beyond which it has no light, as in kernels/draw.cl.
+NO_LIGHT = 46
+# Newton's steps to the distance of a brightness.
+N_NEWTON = 6
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 # Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
@@ -94,65 +98,82 @@ def covariance(parameters, psf_moment):
     return own + psf_moment, np.concatenate([2 * own[..., None, :, :], by_g], axis=-3)
 
 
-def _b(n):
-    """b of n, and its derivative."""
-    return 2 * n - 1 / 3 + 0.009876 / n, 2 - 0.009876 / n**2
+class GalaxyGaussians:
+    """The Gaussians of galaxies, of second moments v_k (C - C_psf) + C_psf; arrays (n, K).
 
+    parameters (n, 4); psf_moment (n, 2, 2)
 
-HALF_LIGHT = 2 * _b(0.5)[0]  # w
-
-
-class SersicProfile:
-    """S of galaxies as a function of q / w, see the module's text; all arrays (n,).
-
-    parameters (n, 4); psf_moment (n, 2, 2); c (n, 2, 2): of these, if it is known
-
-    m, b, s, n: as there;  soft: s without SHARP;  rest: b s^m
-    light: integral of S over q / w from 0 on, K = 2 n b^(-2n) exp(b s^m) Gamma(2n, b s^m)
-    peak: of the profile of unit integral, 1 / (pi w K sqrt(det C))
+    part: of the light, a_k;  moment (..., 3) and inverse (..., 3): yy, yx, xx of each
+    root: of the determinants of the moments;  peak: of each, a_k / (2 pi root)
     """
 
-    def __init__(self, parameters, psf_moment, c=None):
-        c = covariance(parameters, psf_moment)[0] if c is None else c
-        beta, det = np.exp(parameters[..., 3]), np.linalg.det(c)
-        self.by_beta = beta / (beta + BETA_0) ** 2  # - dn / d ln beta
-        self.n = 0.5 + 1 / (beta + BETA_0)
-        self.m, (self.b, self._slope) = 0.5 / self.n, _b(self.n)
-        self.soft = SOFT * np.sqrt(np.linalg.det(psf_moment) / det)
-        self.s = SHARP + self.soft
-        self.rest = self.b * self.s**self.m
-        self.light = np.exp(self._log_light(self.n))
-        self.peak = 1 / (np.pi * HALF_LIGHT * self.light * np.sqrt(det))
+    def __init__(self, parameters, psf_moment):
+        parameters = np.asarray(parameters)
+        own, by = covariance(parameters, 0.0)
+        matrices = np.concatenate([by, own[..., None, :, :]], axis=-3)
+        self._entries = matrices[..., [0, 0, 1], [0, 1, 1]].swapaxes(-1, -2)  # of own, by slope
+        self.part, ln_v, self._part_slope, self._ln_v_slope = gaussians(parameters[..., 3])
+        self._v = np.exp(ln_v)
+        psf = psf_moment[..., [0, 0, 1], [0, 1, 1]]
+        self.moment = self._v[..., None] * self._entries[..., None, :, 3] + psf[..., None, :]
+        yy, yx, xx = np.moveaxis(self.moment, -1, 0)
+        determinant = yy * xx - yx**2
+        self.inverse = np.stack([xx, -yx, yy], axis=-1) / determinant[..., None]
+        self.root = np.sqrt(determinant)
+        self.peak = self.part / (2 * np.pi * self.root)
 
-    def _log_light(self, n):
-        b = _b(n)[0]
-        rest = b * self.s ** (0.5 / n)
-        cut = np.log(gammaincc(2 * n, rest)) + gammaln(2 * n)
-        return np.log(2 * n) - 2 * n * np.log(b) + rest + cut
-
-    def wing_slopes(self):
-        """c_k (3, n) of d ln S / d ln beta = c_0 + p (c_1 + c_2 ln g), p = g^m, g = s + q / w."""
-        step = 1e-5 * self.n
-        light = (self._log_light(self.n + step) - self._log_light(self.n - step)) / (2 * step)
-        by_p, by_log = -self._slope, 2 * self.b * self.m**2
-        constant = -light - self.rest / self.b * (by_p + by_log * np.log(self.s))
-        return -self.by_beta * np.stack([constant, by_p, by_log])
+    def slopes(self):
+        """Factors (n, K, 4, 4) of y^2, y x, x^2 and 1 times Gaussians in slopes by parameters."""
+        a, b, c = np.moveaxis(self.inverse, -1, 0)
+        scale = self.peak * self._v
+        aa, bb, cc = (scale * one * one / 2 for one in (a, b, c))
+        ab, bc, mixed = scale * a * b, scale * b * c, scale * a * c + 2 * bb
+        a, b, c = scale * a / 2, scale * b, scale * c / 2
+        factors = np.empty((*self.peak.shape, 4, 4))
+        for i in range(4):
+            # entries of I D I / 2 and - tr(I D) / 2, for the inverse I and the slope D of a moment
+            yy, yx, xx = np.moveaxis(self._entries[..., None, :, i], -1, 0)
+            one = factors[..., i, :]
+            one[..., 0] = aa * yy + ab * yx + bb * xx
+            one[..., 1] = ab * yy + mixed * yx + bc * xx
+            one[..., 2] = bb * yy + bc * yx + cc * xx
+            one[..., 3] = -(a * yy + b * yx + c * xx)
+        factors[..., 3, :] *= self._ln_v_slope[..., None]
+        factors[..., 3, 3] += self._part_slope / (2 * np.pi * self.root)
+        return factors
 
     def reach(self, threshold):
-        """q where profiles fall to a part (n,) of their peaks; at most 1e12, which fills frames."""
-        with np.errstate(over="ignore"):
-            g = ((self.rest - np.log(threshold)) / self.b) ** (2 * self.n)
-        return HALF_LIGHT * np.minimum(g - self.s, 1e12)
+        """Distance (n, 2) along y and x where profiles fall to a part (n,) of their peaks."""
+        level = threshold * self.peak.sum(axis=-1)
+        along = [_distance(self.moment[..., i], self.peak, level) for i in (0, 2)]
+        return np.stack(along, axis=-1)
 
-    def outside(self, q):
-        """Part (n,) of the light beyond q."""
-        p = (self.s + q / HALF_LIGHT) ** self.m
-        return gammaincc(2 * self.n, self.b * p) / gammaincc(2 * self.n, self.rest)
+    def outside(self, r):
+        """Part (n,) of the light beyond ellipses of the area of circles of radius r (n,) [px]."""
+        return (self.part * self._fall(r)).sum(axis=-1)
 
     def threshold(self, outside):
-        """Part (n,) of the peak beyond which lies a part of the light."""
-        y = gammainccinv(2 * self.n, outside * gammaincc(2 * self.n, self.rest))
-        return np.exp(np.minimum(self.rest - y, 0))
+        """Part (n,) of the peak beyond which lies a part (n,) of the light."""
+        r = _distance(self.root, self.part, outside)
+        return (self.peak * self._fall(r)).sum(axis=-1) / self.peak.sum(axis=-1)
+
+    def _fall(self, r):
+        return np.exp(-np.square(r)[..., None] / (2 * self.root))
+
+
+def _distance(variance, part, level):
+    """Distance r (n,) where the sum of part exp(-r^2 / (2 variance)) over K falls to `level`.
+
+    The logarithm of the sum is convex in r^2 and not below that of one Gaussian: from where the
+    first of these falls to the level Newton's steps come near the distance from inside.
+    """
+    part, level = np.maximum(part, 1e-30), np.broadcast_to(level, part.shape[:1])
+    x = (2 * variance * np.log(part / level[:, None])).max(axis=-1, initial=0)  # r^2
+    for _ in range(N_NEWTON):
+        each = part * np.exp(-x[:, None] / (2 * variance))
+        whole = each.sum(axis=-1)
+        x += np.maximum(np.log(whole / level), 0) * whole / (each / (2 * variance)).sum(axis=-1)
+    return np.sqrt(x)
 
 
 def galaxy_reach(parameters, psf_moment, threshold):
@@ -160,31 +181,18 @@ def galaxy_reach(parameters, psf_moment, threshold):
 
     parameters (n, 4); psf_moment (n, 2, 2); threshold (n,)
     """
-    c = covariance(parameters, psf_moment)[0]
-    q = SersicProfile(parameters, psf_moment, c).reach(threshold)
-    return np.sqrt(q[:, None] * np.diagonal(c, axis1=1, axis2=2))
+    return GalaxyGaussians(parameters, psf_moment).reach(threshold)
 
 
 def wave_light(parameters, psf_moment, nu):
     """Largest transform (n,) of profiles of unit integral at frequencies nu (n,) [1/px].
 
     parameters (n, 4); psf_moment (n, 2, 2)
-    It is largest along C's smallest axis, of variance v: with k = 2 pi nu sqrt(v),
-
-        2 / (w K) integral of S(r) J_0(k r) r exp(-(r / R)^2) dr,   r = sqrt(q),   R = 12 / k
-
-    where the factor with R cuts the wings, and shifts nu by some of 1 / R.
     """
-    c = covariance(parameters, psf_moment)[0]
-    radial = SersicProfile(parameters, psf_moment, c)
-    k = 2 * np.pi * nu * np.sqrt(np.linalg.eigvalsh(c)[:, :1])
-    node, weight = np.polynomial.legendre.leggauss(N_NODES)
-    x, weight = (node + 1) / 2, weight / 2
-    kr = 48 * x**2  # dr = 96 x dx / k
-    g = radial.s[:, None] + (kr / k) ** 2 / HALF_LIGHT
-    s = np.exp(radial.rest[:, None] - radial.b[:, None] * g ** radial.m[:, None])
-    part = (s * (96 * weight * x * kr * j0(kr) * np.exp(-((kr / 12) ** 2)))).sum(axis=1)
-    return np.abs(part) * 2 / (HALF_LIGHT * radial.light * k[:, 0] ** 2)
+    some = GalaxyGaussians(parameters, psf_moment)
+    yy, yx, xx = np.moveaxis(some.moment, -1, 0)
+    least = (yy + xx) / 2 - np.hypot((yy - xx) / 2, yx)
+    return (some.part * np.exp(-2 * np.pi**2 * np.reshape(nu, (-1, 1)) ** 2 * least)).sum(axis=-1)
 
 
 def profile(parameters, position, shape, psf_moment, *, slopes=True, moved=False):
@@ -193,34 +201,22 @@ def profile(parameters, position, shape, psf_moment, *, slopes=True, moved=False
     The profile alone (1, ny, nx) without `slopes`; if `moved`, those by the position (y, x) [px]
     too, (7, ny, nx).
     """
-    c, by_parameter = covariance(parameters, psf_moment)
-    radial = SersicProfile(np.asarray(parameters), psf_moment, c)
-    inverse = np.linalg.inv(c)
-    dy, dx = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
-    dy = dy[:, None]
-    u, v = (inverse[i, 0] * dy + inverse[i, 1] * dx for i in (0, 1))  # C^-1 x
-    q = dy * u + dx * v
-    g = radial.s + q / HALF_LIGHT
-    log = np.log(g)
-    p = np.exp(radial.m * log)
-    s = radial.peak * np.exp(radial.rest - radial.b * p)
-    if not slopes:
-        return s[None]
-    fall = radial.b * radial.m / HALF_LIGHT * p / g  # - d ln S / dq
-    out = np.empty((7 if moved else 5, *q.shape))
-    out[0] = s
-    squares = np.stack([u * u, 2 * u * v, v * v]).reshape(3, -1)
-    by_q = (by_parameter[:, [0, 0, 1], [0, 1, 1]] @ squares).reshape(3, *q.shape)  # - dq
-    half_trace = 0.5 * np.trace(inverse @ by_parameter, axis1=1, axis2=2)[:, None, None]
-    # s falls as sqrt(det C) grows
-    out[1:4] = fall * (by_q + HALF_LIGHT * radial.soft * half_trace)
-    out[1:4] -= half_trace * (1 + radial.soft / radial.light)
-    out[1:4] *= s
-    by_beta = radial.wing_slopes()
-    out[4] = s * (by_beta[0] + p * (by_beta[1] + by_beta[2] * log))
+    some = GalaxyGaussians(np.asarray(parameters)[None], np.asarray(psf_moment)[None])
+    (peak,), (inverse,) = some.peak, some.inverse
+    y, x = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
+    y, x = (a.ravel() for a in np.broadcast_arrays(y[:, None], x))
+    terms = np.stack([y * y, y * x, x * x, np.ones(len(y))])
+    exponent = (inverse * [0.5, 1, 0.5]) @ terms[:3]
+    lit, drawn = exponent < NO_LIGHT, np.zeros_like(exponent)  # (K, pixels)
+    np.exp(-exponent, where=lit, out=drawn)
+    parts = [(peak @ drawn)[None]]
+    if slopes:
+        factors = some.slopes()[0].transpose(2, 1, 0)  # terms, slopes, Gaussians
+        parts.append(sum((f @ drawn) * term for f, term in zip(factors, terms, strict=True)))
     if moved:
-        np.multiply(2 * s * fall, (u, v), out=out[5:])
-    return out
+        by_place = (peak[:, None] * inverse).T[[[0, 1], [1, 2]]] @ drawn
+        parts.append(by_place[:, 0] * y + by_place[:, 1] * x)
+    return np.concatenate(parts).reshape(-1, *shape)
 
 
 @functools.lru_cache(maxsize=N_OTFS)

@@ -134,7 +134,7 @@ def test_structure_of_another_galaxy_is_not_taken(ended, device):
     given = {"thetas": first.thetas, "structures": ((strange,), other)}
     short = Settings(max_iter=1, errors=False)
     begun = deblend_many([replace(scene, **given)], settings=short, device=device)[0]
-    assert begun.losses[0] == pytest.approx(first.losses[0], rel=1e-3)
+    assert begun.losses[0] == pytest.approx(first.losses[0], rel=2e-3)
 
 
 def test_structure_of_another_prior_is_refused(ended, device):

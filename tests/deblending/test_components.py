@@ -126,7 +126,7 @@ def test_two_found_are_as_two_asked_for(two, device):
     result, b, _ = two
     known = (replace(b.sources[0], n_components=2), b.sources[1])
     told = deblend(b.observations, known, frame=b.frame, device=device)
-    assert result.losses[-1] == pytest.approx(told.losses[-1], abs=2)
+    assert result.losses[-1] == pytest.approx(told.losses[-1], abs=5)
 
 
 @pytest.mark.parametrize(("which", "kept"), [(0, {2: 1}), (2, {0: 0, 2: 1})])

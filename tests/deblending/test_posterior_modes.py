@@ -122,7 +122,7 @@ def test_slopes_of_moments_are_finite_differences():
 def test_what_lies_beyond_a_box():
     """Sums are those of the whole profile, wherever the box ends."""
     home, position = scenes.frame(), np.array([13.3, 15.8])
-    shape, theta = GalaxyProfile(home), np.array([0.9, 0.2, -0.1, 1.0])
+    shape, theta = GalaxyProfile(home), np.array([0.9, 0.2, -0.1, 0.5])
     whole = shape.draw(theta, position + 60, (150, 156))[0]
     whole /= whole.max()
     low = np.array([4, 6])

@@ -8,13 +8,12 @@ import numpy as np
 
 from ...sky.mapping import on_wide_pixels
 from ..profiles import (
-    HALF_LIGHT,
+    GalaxyGaussians,
     GalaxyProfile,
-    SersicProfile,
-    covariance,
     galaxy_reach,
     wave_light,
 )
+from ..sersic import N_GAUSSIANS
 
 # [px] Sides of boxes. There are few sizes, since each needs an operator, and components in boxes of
 # one size are rendered together. With more sizes, scenes with different pixel grids take a quarter
@@ -97,7 +96,7 @@ def peaks_of(components, thetas):
     out, smooth = np.zeros(len(components)), _galaxies(components)
     if smooth.any():
         theta, moment = _stacked(components, thetas, smooth)
-        out[smooth] = SersicProfile(theta, moment).peak
+        out[smooth] = GalaxyGaussians(theta, moment).peak.sum(axis=-1)
     for i in np.flatnonzero(~smooth):
         out[i] = components[i].shape.peak
     return out
@@ -220,39 +219,35 @@ class ComponentBatch:
         place = np.array([c.position for c in self.components])[at] - self.origin[at]
         place = on_wide_pixels(place, pixel)
         tallest, widest = self.size[at].max(axis=0).tolist()
+        n_images = int(self.n_images[at].max())
+        shapes = _shapes(theta, place, moment / pixel[..., None] ** 2, slopes=n_images > 1)
         launch = device.launcher(
             "draw.cl",
             "draw_profiles",
             dtype=dtype,
             local_size=tuning.local_size(3),
             ROWS=tuning.row_loops,
-            K=int(self.n_images[at].max()),
+            K=n_images,
+            N_GAUSSIANS=N_GAUSSIANS,
         )
         launch(
             (1 if tuning.row_loops else widest, tallest, len(table)),
             table=device.put(table),
-            shape=device.put(_shapes(theta, place, moment / pixel[..., None] ** 2), dtype),
+            shape=device.put(shapes, dtype),
             images=images,
         )
 
 
-def _shapes(theta, place, moment):
-    """Parameters of galaxies for kernels/draw.cl: (n, N_SHAPE)."""
-    c, slopes = covariance(theta, moment)
-    radial, inverse = SersicProfile(theta, moment, c), np.linalg.inv(c)
-    traces = np.einsum("nij,nkji->nk", inverse, slopes) / 2
-    inside = 1 + radial.soft / radial.light
-    by = np.stack(
-        [
-            *HALF_LIGHT * slopes[..., [0, 0, 1], [0, 1, 1]].transpose(2, 0, 1),
-            traces * inside[:, None],
-        ],
-        axis=-1,
-    )
-    inverse = inverse / HALF_LIGHT
-    head = [*place.T, inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]]
-    head += [radial.s, radial.m, radial.b, radial.rest, radial.peak, radial.soft / inside]
-    return np.column_stack([*head, *radial.wing_slopes(), by.reshape(len(theta), -1)])
+def _shapes(theta, place, moment, *, slopes):
+    """Parameters of galaxies for kernels/draw.cl, see there: (n, 2 + K N)."""
+    some = GalaxyGaussians(theta, moment)
+    n, k = some.peak.shape
+    rows = np.empty((n, k, 20 if slopes else 4))
+    np.multiply(some.inverse, [0.5, 1, 0.5], out=rows[..., :3])
+    rows[..., 3] = some.peak
+    if slopes:
+        rows[..., 4:] = some.slopes().reshape(n, k, 16)
+    return np.concatenate([place, rows.reshape(n, -1)], axis=1)
 
 
 def listed_by_scene(of_slots, scenes):

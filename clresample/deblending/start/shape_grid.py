@@ -37,7 +37,7 @@ import numpy as np
 
 from ..linear.component_batch import peaks_of, renumbered
 from ..linear.spectra import MODEL_ERROR
-from ..profiles import GalaxyProfile, SersicProfile, covariance
+from ..profiles import GalaxyGaussians, GalaxyProfile
 from .first_profiles import NEED
 from .population import LEARNED
 
@@ -246,9 +246,7 @@ def part_inside(components, theta):
     half = np.array([min(c.frame) for c in components]) / 2
     moment = np.array([c.shape.psf_moment for c in components])
     theta = theta * [1, 0, 0, 1]
-    c = covariance(theta, moment)[0]
-    width = np.trace(c, axis1=1, axis2=2) / 2
-    return 1 - SersicProfile(theta, moment, c).outside(half**2 / width)
+    return 1 - GalaxyGaussians(theta, moment).outside(half)
 
 
 def _fitted_again(fit, better):

@@ -74,7 +74,8 @@ def _direction(scene, state, boxes, pair, evidence, strengths):
     alone = (power * scene.spectrum_curvature[j]).sum()
     # the prior's term is at least that of light as wide as the widest kernel
     widest = (np.square(alpha * prior.scales_px) * 4 * np.pi).sum()
-    least = np.divide(wanted**2, p, where=p > 0, out=np.zeros_like(p)).sum() / widest
+    squares = np.square(wanted, dtype=float)  # over the faintest p of float32 they are large
+    least = np.divide(squares, p, where=p > 0, out=np.zeros(p.shape)).sum() / widest
     if (wanted**2).sum() < MIN_SHARED * (theirs**2).sum() or least > MAX_CURVATURE * alone:
         return None
     z, u = coefficients_of(prior, profile, wanted, alpha, window)
