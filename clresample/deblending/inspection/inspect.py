@@ -15,6 +15,7 @@ from .centroids import centroids
 from .counts import count_lines
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
+from .matched_widths import width_lines
 from .noisy_variance import prepared
 from .pixel_noise import noise_lines
 from .star_psfs import replace_by_stars, with_star_psfs
@@ -124,7 +125,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         images.append(image)
     messages += _offset(images, found)
     moved, lines = shifted.disagreements(images, found, settings.fit_shifts)
-    lines += count_lines(images if moved is None else map(InspectedImage.moved, images, moved))
+    there = images if moved is None else list(map(InspectedImage.moved, images, moved))
+    lines += count_lines(there) + width_lines(there)
     move = moved is not None if settings.fit_shifts == AUTO else bool(settings.fit_shifts)
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):

@@ -106,9 +106,9 @@ def _closer(one, other):
     places = other.model_places(chosen[one.inside[chosen]])
     inverse = np.linalg.inv(other.matrix)
     scale = np.sqrt(abs(np.linalg.det(inverse)))
-    plane = ImagePlane.of(one, _channels_of_light(one)[0])
+    plane = ImagePlane.of(one, channels_of_light(one)[0])
     shifts, errors = np.zeros((0, 2)), np.zeros(0)
-    for n, c in enumerate(_channels_of_light(other)[:MAX_CHANNELS], 1):
+    for n, c in enumerate(channels_of_light(other)[:MAX_CHANNELS], 1):
         found = _trusted(*shifts_at(plane, ImagePlane.of(other, c), places))
         shifts, errors = np.concatenate([shifts, found[0]]), np.concatenate([errors, found[1]])
         shift, error = common(shifts @ inverse.T, errors * scale)
@@ -128,7 +128,7 @@ def _trusted(shifts, errors):
     return shifts, np.where(errors < MAX_ERROR_PX, errors, np.inf)
 
 
-def _channels_of_light(image):
+def channels_of_light(image):
     """Channels (C,) of an InspectedImage, those in which its sources are brightest first."""
     light = np.maximum(image.significance, 0) ** 2
     return np.argsort(-light.sum(axis=(1, 2)), kind="stable")
@@ -139,7 +139,7 @@ def _channel_lines(image, found):
     n_channels = found.offsets.shape[1]
     if n_channels == 1 or not len(found.sources):
         return []
-    first = _channels_of_light(image)[0]
+    first = channels_of_light(image)[0]
     lines = []
     for c in range(n_channels):
         if c == first:

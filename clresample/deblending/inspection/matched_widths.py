@@ -1,0 +1,116 @@
+"""Names PSFs whose width disagrees with the light of the same sources in a sharper image.
+
+The light of a source in two images, each convolved with the other's PSF, is the same but for a
+factor, if both PSFs are right. If the second one's, of width sigma, is too narrow by the part p,
+
+    V = b + a (U - t . grad U + p sigma^2 laplace U),    V = P_A * d_B,    U = P_B * d_A,
+
+whatever the source's shape. Its colour may differ inside it: the size of its own light, from the
+same fit of U to a point P_A * P_B, is known in the other band to a part COLOUR only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import laplace, map_coordinates
+
+from .disagreement import Blur, ImagePlane, Matched
+from .image import SIGMAS_A_FWHM
+from .psf_samples import psf_at
+from .shifted import channels_of_light, sharpest
+
+# [1], [sigma] Smallest part p that is named, and its significance; its smallest error.
+MIN_PART, MIN_SIGMAS, FLOOR = 0.05, 5.0, 0.01
+COLOUR = 0.3
+# [sigma] Least light of a source whose width is compared, in either image.
+MIN_LIGHT = 100.0
+# Sources, the brightest, and channels, those of most light, that are compared.
+MAX_SOURCES, MAX_CHANNELS = 3, 3
+# [FWHM of the wider PSF] Radius of the pixels compared, and distance of other sources, at least.
+RADIUS_FWHM, ALONE_FWHM = 1.5, 3.0
+MIN_PIXELS = 20  # number of those pixels
+
+
+def width_lines(images) -> list[str]:
+    """A message about each observation whose light has another width than a sharper one allows."""
+    lines, first = [], sharpest(images)
+    one = images[first]
+    for i, other in enumerate(images):
+        chosen = _bright_alone(one, other) if i != first else []
+        wrong = {}
+        for c in channels_of_light(other)[:MAX_CHANNELS] if len(chosen) else ():
+            part, error = _mean(*_excess(one, channels_of_light(one)[0], other, c, chosen))
+            if abs(part) > max(MIN_PART, MIN_SIGMAS * error):
+                wrong[other.observation.channels[c]] = part
+        for how, which, sign in (("wider", "narrow", 1), ("narrower", "wide", -1)):
+            some = {name: 100 * abs(part) for name, part in wrong.items() if sign * part > 0}
+            if some:
+                shares = ", ".join(f"{name} by {part:.0f} %" for name, part in some.items())
+                lines.append(
+                    f"{other.observation.label}: light is {how} than its PSF makes that of "
+                    f"{one.observation.label}: in {shares} of the PSF's width; the PSF is too "
+                    f"{which}: check it, and the size of its samples (spacing)"
+                )
+    return lines
+
+
+def _mean(parts, errors):
+    """Mean of parts (n,) with errors (n,), and its error."""
+    known = np.isfinite(errors)
+    if not known.any():
+        return 0.0, np.inf
+    weights = errors[known] ** -2
+    mean, error = weights @ parts[known] / weights.sum(), weights.sum() ** -0.5
+    return float(mean), max(float(error), float(np.std(parts[known])), FLOOR)
+
+
+def _bright_alone(one, other):
+    """Sources (n,) that are bright in both images and have no neighbour near in the second."""
+    both = one.inside & other.inside & (np.minimum(one.light, other.light) > MIN_LIGHT)
+    chosen = other.brightest[both[other.brightest]]
+    places = other.places[np.isfinite(other.places).all(axis=1)]
+    away = np.hypot(*(places - other.places[chosen][:, None]).transpose(2, 0, 1))
+    crowded = (away < ALONE_FWHM * other.width_px).sum(axis=1) > 1
+    return chosen[~crowded][:MAX_SOURCES]
+
+
+def _excess(one, c_one, other, c_other, chosen):
+    """Parts p (n,) of sources `chosen` (n,) and their errors, infinite where unknown."""
+    planes = ImagePlane.of(one, c_one), ImagePlane.of(other, c_other)
+    pair = Matched.of(*planes, one.model_places(chosen), RADIUS_FWHM)
+    parts, errors = np.zeros(len(chosen)), np.full(len(chosen), np.inf)
+    if np.count_nonzero(pair.good) < MIN_PIXELS:
+        return parts, errors
+    variance = (planes[1].psf.fwhm_px[0] / SIGMAS_A_FWHM) ** 2
+    light, there, good = pair.light(planes[0].data), pair.there(), pair.good[pair.window]
+    own = Blur(planes[1], planes[1].psf, np.eye(2))
+    behind = map_coordinates(one.variance[c_one], pair.at, order=1, mode="nearest")
+    y, x = np.indices(pair.good.shape)[:, *pair.window]
+    for k, (place, near) in enumerate(zip(one.places[chosen], pair.near, strict=True)):
+        disc = good & (np.hypot(y - near[0], x - near[1]) <= pair.radius)
+        if np.count_nonzero(disc) < MIN_PIXELS:
+            continue
+        factor, part, estimator = _fitted(light, there, disc, variance)
+        shape = planes[0].data.shape
+        point = psf_at(
+            planes[0].psf, 0, *(np.arange(n) - p for n, p in zip(shape, place, strict=True))
+        )
+        _, size, _ = _fitted(pair.light(point), light, disc, variance)
+        # noise is correlated by the convolutions
+        weight = np.zeros(pair.good.shape)
+        weight[pair.window][disc] = estimator
+        noise = (pair.smear_there.of(weight) ** 2 * other.variance[c_other]).sum()
+        noise += factor**2 * pair.area * (own.of(weight) ** 2 * behind).sum()
+        if factor > 0:
+            parts[k] = part
+            errors[k] = np.hypot(np.sqrt(noise) / factor, COLOUR * size)
+    return parts, errors
+
+
+def _fitted(light, there, disc, variance):
+    """Factor a and part p of `there` against `light`, and the estimator of a p, over a disc."""
+    columns = [light, *np.gradient(light), variance * laplace(light, mode="nearest")]
+    design = np.stack([np.ones(np.count_nonzero(disc)), *(column[disc] for column in columns)])
+    estimator = np.linalg.pinv(design.T)
+    found = estimator @ there[disc]
+    return float(found[1]), float(found[4] / found[1]) if found[1] else 0.0, estimator[4]
