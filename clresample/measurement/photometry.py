@@ -166,11 +166,17 @@ def add_groups(table, result, flux, covariance, groups):
 
 
 def whole_groups(rows, bands):
-    """Sets the group columns of groups whose members were fitted apart, in Columns of all fits.
+    """Sets the group columns of all fits' Columns as they are in all of them together.
 
-    Their fluxes are the sums of their members', their errors those of members without covariance.
+    A group has the id of its brightest member, whichever was detected as its galaxy. Where members
+    were fitted apart, its fluxes are the sums of theirs, and errors those without covariance.
     """
     _, number, count = np.unique(rows["group_id"], return_inverse=True, return_counts=True)
+    fluxes = [np.nan_to_num(rows[f"flux_{b}"]) for b in bands if f"flux_{b}" in rows]
+    faintest_first = np.argsort(np.sum(fluxes, axis=0) + np.zeros(len(number)), kind="stable")
+    brightest = np.zeros(len(count), int)
+    brightest[number[faintest_first]] = faintest_first
+    rows.put("group_id", rows["id"][brightest][number])
     apart = rows["n_group"] != count[number]
     if not apart.any():
         return

@@ -90,30 +90,36 @@ def test_a_piece_moves_by_errors_and_by_part_of_its_flux(monkeypatch, flux, erro
 
 
 @pytest.mark.parametrize(
-    ("large", "moves", "fitted", "unsettled"),
+    ("light", "large", "moves", "fitted", "unsettled"),
     [
-        ({0}, [{0, 2}, {1}, set()], [{0, 2}, {1}, {2}], set()),
-        ({0}, [{0, 2}, set()], [{0, 2}, {1}], set()),
-        ({0}, [set(), {1}, {2}, {1, 2}], [{0, 2}, {1}, {2}, {1}, {2}, {1}, {2}, {1}], {70}),
-        ({0}, [{0, 1, 2}], [{0, 2}, {1}, {2}, {1}, {2}, {1}, {2}, {1}], {70}),
-        ({0, 1, 2}, [{0, 1, 2}], [{0, 1, 2}], set()),
+        # 1 is fainter than both others, and none of these moves
+        ((3, 1, 2), {}, [{1}, set()], [{1}, {0, 2}], set()),
+        # both move, and 1 is fitted once more
+        ((3, 1, 2), {}, [{1}, {0, 2}, set()], [{1}, {0, 2}, {1}], set()),
+        # each has the last light of the one before
+        ((1, 2, 3), {}, [{0}, {1}, set()], [{0}, {1}, {0, 2}], set()),
+        # 0 has its only fit before 1 moves for the last time
+        ((1, 2, 3), {0}, [{0}, {1}, {2}, {1}, set()], [{0}, {1}, {2}, {1}, {2}], {70}),
+        ((1, 2, 3), {0, 1, 2}, [{0}, {1}, {2}], [{0}, {1}, {2}], set()),
+        ((1, 2), {}, [{0, 1}], [{0}, {1}] * 4, {70}),
     ],
 )
-def test_pieces_beside_a_large_one_wait_for_its_last_fit(
-    monkeypatch, tmp_path, large, moves, fitted, unsettled
+def test_of_neighbours_the_fainter_is_fitted_first(
+    monkeypatch, tmp_path, light, large, moves, fitted, unsettled
 ):
     """Piece 1 is beside 0 and 2; the last of `moves` repeats. Rough fits are not compared with."""
-    siblings = ((1,), (0, 2), (1,))
-    plan = plan_of(siblings, (70, 70, 70), ((0,), (1, 2)))
-    assert rounds_of(monkeypatch, tmp_path, plan, large, moves) == (fitted, unsettled)
+    siblings = ((1,), (0, 2), (1,)) if len(light) == 3 else ((1,), (0,))
+    plan = plan_of(siblings, [70] * len(light), (tuple(range(len(light))),))
+    found = rounds_of(monkeypatch, tmp_path, plan, large, moves, light)
+    assert found == (fitted, unsettled)
 
 
 def test_pieces_that_have_not_settled_are_named_though_others_go_on(monkeypatch, tmp_path):
-    """0 and 1 move to their last round; 3 and 4 waited for 2, and settle a round later."""
-    siblings, parents = ((1,), (0,), (3, 4), (2, 4), (2, 3)), (70, 70, 80, 80, 80)
-    plan, moves = plan_of(siblings, parents, ((0, 1), (2, 3, 4))), [set(range(5))] * 4 + [set()]
-    fitted, unsettled = rounds_of(monkeypatch, tmp_path, plan, {2}, moves)
-    assert fitted[-2:] == [{0, 1, 3, 4}, {3, 4}] and unsettled == {70}
+    """0 and 1 move to their last round; 2 moves once."""
+    plan = plan_of(((1,), (0,), (3,), (2,)), (70, 70, 80, 80), ((0, 1), (2, 3)))
+    moves = [{0, 2}, {1, 3}, {0, 2}, {0, 1}]
+    fitted, unsettled = rounds_of(monkeypatch, tmp_path, plan, {}, moves, (1, 2, 3, 4))
+    assert fitted[:3] == [{0, 2}, {1, 3}, {0, 2}] and unsettled == {70}
 
 
 def plan_of(siblings, parents, cut_groups):
@@ -126,7 +132,7 @@ def plan_of(siblings, parents, cut_groups):
     return SimpleNamespace(patches=patches, groups=groups, cut_groups=cut_groups)
 
 
-def rounds_of(monkeypatch, tmp_path, plan, large, moves):
+def rounds_of(monkeypatch, tmp_path, plan, large, moves, light):
     """The pieces fitted again in each round, and the parents that have not settled."""
     done, left = [], list(moves)
 
@@ -140,6 +146,8 @@ def rounds_of(monkeypatch, tmp_path, plan, large, moves):
     monkeypatch.setattr(rounds, "_fit_round", fit_round)
     monkeypatch.setattr(rounds, "_is_large", lambda _job, n: n in large)
     monkeypatch.setattr(_PieceHistory, "moved", moved)
+    rough = {n: (n, np.array([float(flux)]), None) for n, flux in enumerate(light)}
+    monkeypatch.setattr(_PieceHistory, "_fluxes", lambda self, pairs: rough)
     monkeypatch.setattr(GroupResultsFile, "read", lambda *_: [dict.fromkeys(FOUND_COLUMNS, EMPTY)])
     job = SimpleNamespace(plan=plan, folder=tmp_path)
     progress = SimpleNamespace(stage=lambda *_: None)
@@ -218,8 +226,10 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     assert [b.structures for b in blends] == [(("its structure",), ())] * fitted
 
 
-def test_what_was_found_is_carried_from_round_to_round(tmp_path):
-    parts = _PieceHistory(SimpleNamespace(folder=tmp_path, plan=SimpleNamespace(patches=[])))
+def test_what_was_found_is_carried_from_round_to_round(tmp_path, monkeypatch):
+    monkeypatch.setattr(_PieceHistory, "_fluxes", lambda *_: {})
+    plan = SimpleNamespace(patches=[])
+    parts = _PieceHistory(SimpleNamespace(folder=tmp_path, plan=plan))
     rows = [(3, 77, 15.0, 27.0, 5), (4, 78, 16.5, 2.25, 78)]
     patches = {3: SimpleNamespace(pieces=2), 4: SimpleNamespace(pieces=2)}
     parts.job.plan.patches = patches

@@ -165,6 +165,7 @@ def test_a_groups_flux_is_the_sum_with_the_covariances_of_its_pieces():
 def test_groups_that_were_fitted_apart_are_put_together():
     rows = Columns(
         {
+            "id": np.array([2, 1, 3]),
             "group_id": np.array([1, 1, 3]),
             "n_group": np.array([1, 1, 1], np.int32),
             "flux_r": np.array([10.0, 4.0, 7.0]),
@@ -174,6 +175,7 @@ def test_groups_that_were_fitted_apart_are_put_together():
         }
     )
     whole_groups(rows, ["r", "i"])
+    assert rows["group_id"].tolist() == [2, 2, 3]  # of the brightest, with 10
     assert rows["n_group"].tolist() == [2, 2, 1]
     assert rows["group_flux_r"].tolist() == [14, 14, 7]
     assert rows["group_flux_err_r"].tolist() == [5, 5, 1]

@@ -25,14 +25,16 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None)
     labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on, at
         least those of `cutouts_box`
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
-        pieces of the same blend, to be subtracted. None = their pixels are ignored, like those of
-        all other blends
+        pieces of the same blend, to be subtracted; None = none is known
 
-    A patch that is covered by no mosaic gives a Blend without observations. Raises FileError for
-    pixels that cannot be read.
+    Pixels of other patches are ignored. With those of the other pieces and their light subtracted,
+    a galaxy's structure takes what their models lack, and keeps it: of small galaxies cut from a
+    large one a tenth, silently (`simulate field --sky bright --size 512`, seed 1). A patch that is
+    covered by no mosaic gives a Blend without observations. Raises FileError for pixels that cannot
+    be read.
     """
     grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
-    foreign = _foreign(patch, labels, neighbours is not None)
+    foreign = ~np.isin(labels, [0, patch.number + 1])
     first = np.array(corner) - patch.box[:2]
     observations, boxes = [], {}
     for mosaic in mosaics:
@@ -111,17 +113,6 @@ def cutouts_box(patch, mosaics, reference) -> Box:
         if box.area and np.isfinite(there).all():
             whole = whole.union(Box.around(there))
     return whole
-
-
-def _foreign(patch, labels, siblings_too):
-    """Pixels of labels (Ny, Nx) that belong to other patches: (Ny, Nx) bool.
-
-    siblings_too: False = without those of its own blend's other pieces, whose light is subtracted
-    """
-    known = [0, patch.number + 1]
-    if siblings_too:
-        known += [k + 1 for k in patch.siblings]
-    return ~np.isin(labels, known)
 
 
 def _foreign_pixels(cut, grid, foreign, first):

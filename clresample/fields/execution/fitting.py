@@ -25,7 +25,7 @@ from ...measurement.late_sources import fit_with_late_sources
 from ...resampling.cache import default_cache
 from ...sky.box import Box
 from ...sky.grid import Grid
-from ...sky.sources import ExtendedSource
+from ...sky.sources import ExtendedSource, SourceWarning
 from ..blends.cutouts import make_blend, with_profiles
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
@@ -220,7 +220,8 @@ def _fits(job, blends, rough=None):
     for (limits, *_), alike in sizes.items():  # all at once, those of one size would be padded too
         settings, few = _settings(job, *limits), [blends[i] for i in alike]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)  # the results' messages are stored
+            for kind in (SourceWarning, InputWarning):  # the results' messages are stored
+                warnings.simplefilter("ignore", kind)
             found = deblend_many(few, settings=settings, device=device, memory=job.memory)
         if any(r.status == Ended.INTERRUPTED for r in found):
             raise KeyboardInterrupt

@@ -13,7 +13,7 @@ from ..sky_level import FILE as SKY_FILE
 from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
-FORMAT = 12  # of that folder; raised when another version would misread it
+FORMAT = 13  # of that folder; raised when another version would misread it
 
 
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):

@@ -17,8 +17,7 @@ class FitGroup:
 
     name: of the file of results; patches: numbers; round: 0, or the repetition of a cut blend's
         pieces
-    neighbour_models: (patch, name of a file of results, weight) for each neighbour's model that is
-        subtracted; the weights of a patch add up to 1
+    neighbour_models: (patch, name of a file of results) of neighbours, whose models are subtracted
     last_fits: (patch, name of a file of results) of the fits before, from which these go on
     found: (patch, id, y, x, id of the host) of sources that an earlier round detected in a patch's
         residuals, at (y, x) [px] of the field's model pixels
@@ -27,7 +26,7 @@ class FitGroup:
     name: str
     patches: tuple[int, ...]
     round: int = 0
-    neighbour_models: tuple[tuple[int, str, float], ...] = ()
+    neighbour_models: tuple[tuple[int, str], ...] = ()
     last_fits: tuple[tuple[int, str], ...] = ()
     found: tuple[tuple[int, int, float, float, int], ...] = ()
 
@@ -39,7 +38,7 @@ class GroupInputs:
     labels {patch: (corner (2,) [px], (Ny, Nx) int32)}: patch numbers + 1 of the pixels of its
         cutouts, from the model pixel `corner` on
     light {patch: {mosaic's name: [(Box, model (C, Ny, Nx) [counts])]}}: of the neighbours; None in
-        the first round, where their pixels are ignored
+        the first round
     before {patch: (profiles, structures)}: of the last fits, {id: of each component}, see
         `with_profiles`
     """
@@ -71,13 +70,13 @@ def gather_inputs(job, group) -> GroupInputs:
 
 def _light(job, group):
     """{patch: {mosaic's name: [(Box, model)]}} of neighbours that overlap its cutouts."""
-    shares: dict[str, dict[int, float]] = {}
-    for patch, name, share in group.neighbour_models:
-        shares.setdefault(name, {})[patch] = share
+    of_file: dict[str, list] = {}
+    for patch, name in group.neighbour_models:
+        of_file.setdefault(name, []).append(patch)
     models: dict[int, list] = {}
-    for name, of_patch in sorted(shares.items()):
-        for patch, i, box, model in results_file(job.folder, name).models(of_patch):
-            models.setdefault(patch, []).append((i, box, of_patch[patch] * model))
+    for name, patches in sorted(of_file.items()):
+        for patch, i, box, model in results_file(job.folder, name).models(patches):
+            models.setdefault(patch, []).append((i, box, model))
     found = {}
     for number in group.patches:
         patch = job.plan.patches[number]

@@ -47,8 +47,9 @@ def fit_all_groups(job, engine, progress):
     """Fits all groups that are not on disk yet, round by round.
 
     A cut blend's pieces are fitted again with the new sources of their residuals, and then as long
-    as the fluxes of a neighbour change. Those beside large pieces wait until these are fitted again
-    for the last time, since their rough fits' light would only be replaced.
+    as the fluxes of a neighbour change. Of neighbours the fainter one is fitted first, so that each
+    has the last light of the other: the rough fit of a faint one has the light of the bright one's
+    wings in its pixels, and that would be lost if both gave it up at once.
     returns the GroupResultsFiles, of which the last round of each patch is valid, and the parents
         of the cut blends whose pieces had not settled when the rounds ended
     """
@@ -61,7 +62,7 @@ def fit_all_groups(job, engine, progress):
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
     for n_round in itertools.count(1):
-        again = _without_waiting(job, {n for n in pending if history.may_refit(n)})
+        again = history.first_of({n for n in pending if history.may_refit(n)})
         groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
@@ -71,8 +72,8 @@ def fit_all_groups(job, engine, progress):
                 _name(n_round, i),
                 patches,
                 n_round,
-                history.light_about(patches),
-                tuple((n, history.names[n][-1]) for n in patches),
+                history.last_fits({k for n in patches for k in job.plan.patches[n].siblings}),
+                history.last_fits(patches),
                 history.found_in(patches),
             )
             for i, patches in enumerate(groups)
@@ -81,7 +82,7 @@ def fit_all_groups(job, engine, progress):
         history.add(names)
         moved_now = history.moved(again)
         moved = moved - again | moved_now
-        pending -= again  # the others wait
+        pending -= again
         pending |= {n for n in pieces if moved_now.intersection(job.plan.patches[n].siblings)}
         parts += names
     # a piece's second fit follows a rough one, with which its fluxes cannot be compared
@@ -92,12 +93,6 @@ def fit_all_groups(job, engine, progress):
     }
     # sorted by name, so that sums of models do not depend on the order in which the groups ended
     return [results_file(job.folder, name) for name in sorted(parts)], unsettled
-
-
-def _without_waiting(job, pending):
-    """The pieces among those that are due which do not wait for a large one beside them."""
-    large = {n for n in pending if _is_large(job, n)}
-    return {n for n in pending if n in large or not large & set(job.plan.patches[n].siblings)}
 
 
 def _is_large(job, number):
@@ -111,10 +106,14 @@ def _name(n_round, i):
 
 
 class _PieceHistory:
-    """The files of results of a cut blend's pieces, round by round."""
+    """The files of results of a cut blend's pieces, round by round.
+
+    names {piece: names of its files}; light {piece: sum of all fluxes of its rough fit}
+    found {piece: what was found in its residuals}
+    """
 
     def __init__(self, job):
-        self.job, self.names, self.found = job, {}, {}
+        self.job, self.names, self.found, self.light = job, {}, {}, {}
 
     def add(self, names):
         """Adds a round: {name: patches} of its parts."""
@@ -125,28 +124,31 @@ class _PieceHistory:
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
+        rough = [(n, known[0]) for n, known in self.names.items() if n not in self.light]
+        self.light |= dict.fromkeys((n for n, _ in rough), 0.0)
+        for patch, flux, _ in self._fluxes(rough).values():
+            self.light[patch] += float(np.nansum(flux))
 
     def may_refit(self, patch):
         """Returns True if a piece may be fitted again."""
         most = LARGE_ROUNDS if _is_large(self.job, patch) else ROUNDS
         return len(self.names[patch]) <= most
 
-    def light_about(self, patches):
-        """`FitGroup.neighbour_models` of some pieces: all their neighbours' last models.
+    def first_of(self, pending):
+        """Those of the pieces that are due which do not wait for a neighbour that is.
 
-        From its third fit on, a neighbour's model is the mean of its last two. If both sides of a
-        border used only the last model, light would oscillate between them. In the first fits the
-        neighbours' light was in the data.
+        The one of fewer fits is first, of equally many the fainter one.
         """
-        found = []
-        wanted = {k for n in patches for k in self.job.plan.patches[n].siblings}
-        for patch in sorted(wanted):
-            *older, last = self.names[patch]
-            mean = len(older) >= 2
-            found.append((patch, last, 0.5 if mean else 1.0))
-            if mean:
-                found.append((patch, older[-1], 0.5))
-        return tuple(found)
+
+        def turn(n):
+            return len(self.names[n]), self.light[n], n
+
+        siblings = {n: pending.intersection(self.job.plan.patches[n].siblings) for n in pending}
+        return {n for n in pending if all(turn(n) < turn(k) for k in siblings[n])}
+
+    def last_fits(self, patches):
+        """(patch, name of its last file of results) of some pieces."""
+        return tuple((n, self.names[n][-1]) for n in sorted(patches))
 
     def found_in(self, patches):
         """`FitGroup.found` of some pieces: all that was found in their residuals so far."""
