@@ -36,7 +36,7 @@ from clresample.sky.sources import ExtendedSource, PointSource
 
 def sky_of(*numbers):
     blocks = levels.BlockGrid.of(SHAPE)
-    return levels.SkyLevel(*numbers, blocks, np.zeros((2, len(blocks.centers())), bool), np.ones(2))
+    return levels.SkyLevel(*numbers, blocks, np.zeros((2, len(blocks.centers)), bool), np.ones(2))
 
 
 @pytest.mark.parametrize("seed", range(5))

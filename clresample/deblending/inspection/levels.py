@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class BlockGrid:
     side: int
 
     @classmethod
+    @lru_cache(maxsize=32)
     def of(cls, shape) -> BlockGrid:
         """That of images of a shape (2,), none of images smaller than a block."""
         side = max(MIN_BLOCK_PX, -(-max(shape) // N_BLOCKS))
@@ -48,6 +50,7 @@ class BlockGrid:
         y, x = (n % side // 2 for n in shape)
         return cls((y, x), (n_y, n_x), side)
 
+    @cached_property
     def centers(self) -> np.ndarray:
         """Their centres (B, 2) [px]."""
         pairs = zip(self.corner, self.counts, strict=True)
@@ -126,7 +129,7 @@ def sky_level(image) -> SkyLevel:
     """
     data, usable = image.observation.data, image.usable
     n_channels, blocks = len(data), BlockGrid.of(data.shape[1:])
-    counts, centers = blocks.sums(usable.astype(np.float64)), blocks.centers()
+    counts, centers = blocks.sums(usable.astype(np.float64)), blocks.centers
     means = blocks.sums(np.where(usable, data, 0.0)) / np.maximum(counts, 1)
     white = image.sigma[:, None] / np.sqrt(np.maximum(counts, 1))
     wings = _wings(image, means, centers)

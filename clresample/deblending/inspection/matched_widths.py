@@ -83,26 +83,25 @@ def _excess(one, c_one, other, c_other, chosen):
         return parts, errors
     variance = (planes[1].psf.fwhm_px[0] / SIGMAS_A_FWHM) ** 2
     light, there, good = pair.light(planes[0].data), pair.there(), pair.good[pair.window]
-    own = Blur(planes[1], planes[1].psf, np.eye(2))
-    behind = map_coordinates(one.variance[c_one], pair.at, order=1, mode="nearest")
     y, x = np.indices(pair.good.shape)[:, *pair.window]
     for k, (place, near) in enumerate(zip(one.places[chosen], pair.near, strict=True)):
         disc = good & (np.hypot(y - near[0], x - near[1]) <= pair.radius)
         if np.count_nonzero(disc) < MIN_PIXELS:
             continue
-        factor, part, estimator = _fitted(light, there, disc, variance)
-        shape = planes[0].data.shape
-        point = psf_at(
-            planes[0].psf, 0, *(np.arange(n) - p for n, p in zip(shape, place, strict=True))
-        )
-        _, size, _ = _fitted(pair.light(point), light, disc, variance)
-        # noise is correlated by the convolutions
-        weight = np.zeros(pair.good.shape)
-        weight[pair.window][disc] = estimator
-        noise = (pair.smear_there.of(weight) ** 2 * other.variance[c_other]).sum()
-        noise += factor**2 * pair.area * (own.of(weight) ** 2 * behind).sum()
-        if factor > 0:
-            parts[k] = part
+        factor, parts[k], estimator = _fitted(light, there, disc, variance)
+        if abs(parts[k]) < MIN_PART / 2:  # whatever its error, it names nothing
+            errors[k] = FLOOR
+        elif factor > 0:
+            away = (np.arange(n) - p for n, p in zip(planes[0].data.shape, place, strict=True))
+            point = pair.light(psf_at(planes[0].psf, 0, *away))
+            _, size, _ = _fitted(point, light, disc, variance)
+            # noise is correlated by the convolutions
+            weight = np.zeros(pair.good.shape)
+            weight[pair.window][disc] = estimator
+            noise = (pair.smear_there.of(weight) ** 2 * other.variance[c_other]).sum()
+            own = Blur(planes[1], planes[1].psf, np.eye(2)).of(weight)
+            behind = map_coordinates(one.variance[c_one], pair.at, order=1, mode="nearest")
+            noise += factor**2 * pair.area * (own**2 * behind).sum()
             errors[k] = np.hypot(np.sqrt(noise) / factor, COLOUR * size)
     return parts, errors
 

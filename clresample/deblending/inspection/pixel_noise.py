@@ -79,7 +79,7 @@ def _uneven_lines(local, pixels, blocks, channels):
     ratio = np.ones(len(local))
     for c in np.flatnonzero(counts.sum(axis=1) >= MIN_UNEVEN):
         used = counts[c] > blocks.side**2 / 2
-        centers = blocks.centers()[used]
+        centers = blocks.centers[used]
         away = ((centers[:, None] - centers) ** 2).sum(axis=-1)
         near = np.argsort(away, axis=1, kind="stable")[:, :N_NEAR]
         scatter = np.sqrt(np.median((squares[c] / np.maximum(counts[c], 1))[used][near], axis=1))

@@ -34,7 +34,7 @@ def tilt_lines(image, sky) -> list[str]:
         seen = usable.all(axis=0, keepdims=True)
         data = np.concatenate([data, np.where(seen, data.sum(axis=0) / root, 0.0)])
         usable = np.concatenate([usable, seen])
-    centers, counts = blocks.centers(), blocks.sums(usable.astype(float))
+    centers, counts = blocks.centers, blocks.sums(usable.astype(float))
     free = away_from_sources(image, centers, NEAR_SOURCE) & (2 * counts > blocks.side**2)
     channels = zip(data, blocks.sums(data), counts, free, strict=True)
     rises = np.array([_rise(image, centers, *own) for own in channels])
