@@ -12,9 +12,9 @@ same fit of U to a point P_A * P_B, is known in the other band to a part COLOUR 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import laplace, map_coordinates
+from scipy.ndimage import laplace
 
-from .disagreement import Blur, ImagePlane, Matched
+from .disagreement import ImagePlane, Matched
 from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
 from .shifted import channels_of_light, sharpest
@@ -88,28 +88,30 @@ def _excess(one, c_one, other, c_other, chosen):
         disc = good & (np.hypot(y - near[0], x - near[1]) <= pair.radius)
         if np.count_nonzero(disc) < MIN_PIXELS:
             continue
-        factor, parts[k], estimator = _fitted(light, there, disc, variance)
+        factor, parts[k], error = _fitted(light, there, disc, variance)
         if abs(parts[k]) < MIN_PART / 2:  # whatever its error, it names nothing
             errors[k] = FLOOR
         elif factor > 0:
             away = (np.arange(n) - p for n, p in zip(planes[0].data.shape, place, strict=True))
             point = pair.light(psf_at(planes[0].psf, 0, *away))
-            _, size, _ = _fitted(point, light, disc, variance)
-            # noise is correlated by the convolutions
-            weight = np.zeros(pair.good.shape)
-            weight[pair.window][disc] = estimator
-            noise = (pair.smear_there.of(weight) ** 2 * other.variance[c_other]).sum()
-            own = Blur(planes[1], planes[1].psf, np.eye(2)).of(weight)
-            behind = map_coordinates(one.variance[c_one], pair.at, order=1, mode="nearest")
-            noise += factor**2 * pair.area * (own**2 * behind).sum()
-            errors[k] = np.hypot(np.sqrt(noise) / factor, COLOUR * size)
+            _, size, size_error = _fitted(point, light, disc, variance)
+            errors[k] = np.hypot(error, COLOUR * np.hypot(size, size_error))
     return parts, errors
 
 
 def _fitted(light, there, disc, variance):
-    """Factor a and part p of `there` against `light`, and the estimator of a p, over a disc."""
+    """Factor a and part p of `there` against `light` over a disc, and p's error by what is left.
+
+    variance [px^2]: of the wider PSF, over whose area the residuals are alike
+    """
     columns = [light, *np.gradient(light), variance * laplace(light, mode="nearest")]
     design = np.stack([np.ones(np.count_nonzero(disc)), *(column[disc] for column in columns)])
     estimator = np.linalg.pinv(design.T)
     found = estimator @ there[disc]
-    return float(found[1]), float(found[4] / found[1]) if found[1] else 0.0, estimator[4]
+    if not found[1]:
+        return 0.0, 0.0, np.inf
+    rest = there[disc] - found @ design
+    alike = max(1.0, np.pi / 4 * SIGMAS_A_FWHM**2 * variance)
+    scatter = alike * (rest @ rest) / max(len(rest) - len(found), 1)
+    error = np.sqrt(scatter * (estimator[4] ** 2).sum()) / abs(found[1])
+    return float(found[1]), float(found[4] / found[1]), float(error)
