@@ -3,16 +3,13 @@
 A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile or a
 StarProfile. A profile is drawn from a few parameters theta (n,), which `start` fits to the data.
 
-    S(x) = exp(-b ((s + q / w)^m - s^m)),   q = (x - c)^T C^-1 (x - c),   m = 1 / (2 n)
-    C = sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf      rows and columns (y, x)
-    n = 1/2 + 1 / (beta + BETA_0),   b = b(n),   w = 2 b(1/2)
-    s = SHARP + SOFT sqrt(det C_psf / det C)
+    S(x) = sum_k a_k N(x - c; C_k),   C_k = v_k sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf
 
-Far from its middle it is a profile of Sersic's index n with half of its light within q = w, where
-b(n) = 2 n - 1/3 + 0.009876 / n (Ciotti & Bertin 1999, A&A 352, 447; Prugniel & Simien 1997, A&A
-321, 111). beta -> infinity is a Gaussian, small beta has a cusp and wings; s rounds the cusp as the
-model's PSF does. C_psf is its second moment, so that sigma -> 0 is as wide as a star. Stars are
-the model's PSF itself, see `draw_psf`.
+is a galaxy of Sersic's index n with half of its light within an ellipse of sigma sqrt(2 ln 2),
+behind a Gaussian of C_psf, the second moment of the model's PSF; rows and columns (y, x). a_k and
+v_k are those of n = 1/2 + 1 / (beta + BETA_0), see sersic.py. beta -> infinity is a Gaussian, small
+beta has a cusp and wings, and sigma -> 0 is as wide as a star. Stars are the model's PSF itself,
+see `draw_psf`.
 """
 
 from __future__ import annotations
@@ -40,24 +37,16 @@ MIN_GALAXY_MOMENT = 0.25
 # with a scatter of 0.17 per component; n of 0.52 to 0.85. Real galaxies are less round, 0.26
 # (Leauthaud et al. 2007). With that scatter models of faint galaxies follow the noise: median SDRs
 # of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to 0.3 dB lower in Euclid's or Rubin's
-# images alone. Without that smoothing they are equal. With WINGS of 25 and a scatter of 1 they are
-# 0.05 dB higher (48 scenes, seeds from 71000 and 3000), but stars at the middle of compact hosts
-# have the light of these: a star three times as bright as its host of n = 4, r_e = 0.25", 1.12 of
-# its flux at 5 errors, and 1.05 at 2.0 with these. With 6.5 they are 0.05 dB lower.
+# images alone. Without that smoothing they are equal. With WINGS of 25 and 60 mean SDRs of COSMOS
+# galaxies are 0.02 and 0.04 dB higher jointly, 0.1 and 0.15 dB in Rubin's images (40 scenes, seeds
+# from 83001), but stars at the middle of compact hosts have the light of these: one of signal to
+# noise 100 in a host of 100, n = 2.5, r_e = 0.4", 1.45 of its flux at 8 errors, and 1.22 at 2.6
+# with these. With 6 they are 0.06 dB lower.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.17
 WINGS, WINGS_SCATTER = 12.0, 1.5
 # Several components of a source start this far apart in ln(size), as a bulge and a disk do.
 COMPONENT_SPREAD = 1.0
-# n is at most 1/2 + 1 / BETA_0, 8.2.
-BETA_0 = 0.13
-# s of a galaxy far larger than the PSF, and the rest of s for one as small as the PSF. Fits of
-# Sersic galaxies of n = 1 to 4 and r_e = 2 to 16 px then leave 400 in chi2 in the mean at a signal
-# to noise of 600, and lack 2.7 % of their light; with a free s they leave 366 and lack 2.7 %, with
-# 0.4 in place of 1.5 they leave 685 and lack 5 %, with 3 1440 and 9 %.
-SHARP, SOFT = 5e-4, 1.5
-# Nodes of the quadrature of `wave_light`.
-N_NODES = 192
 # Exponent of a Gaussian beyond which it has no light, as in kernels/draw.cl.
 NO_LIGHT = 46
 # Newton's steps to the distance of a brightness.

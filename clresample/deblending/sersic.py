@@ -93,9 +93,8 @@ def _fitted(n):
 def _light(y, n, n_nodes=100):
     """Light (k,) of Gaussians in equal intervals of ln v about y (k,), but for a factor."""
     m, u = 0.5 / n, (np.arange(n_nodes) + 0.5) * np.pi / n_nodes
-    t = (
-        np.log(HALF_LIGHT / 2) - 2 * n * np.log(gammaincinv(2 * n, 0.5)) - y[:, None]
-    )  # ln of b^(-2n) w / 2 v
+    # ln of b^(-2n) w / 2 v
+    t = np.log(HALF_LIGHT / 2) - 2 * n * np.log(gammaincinv(2 * n, 0.5)) - y[:, None]
     a = m * np.log(np.sin(m * u)) + (1 - m) * np.log(np.sin((1 - m) * u)) - np.log(np.sin(u))
     x = np.exp(np.clip((a - m * t) / (1 - m), -300, 7))
     return np.mean(x * np.exp(-x), axis=1) * np.exp(y)
