@@ -21,8 +21,8 @@ from scipy.special import gammaincinv, gammaln
 # n is at most 1/2 + 1 / BETA_0, 8.2.
 BETA_0 = 0.13
 # Gaussians of a profile, which differ from it by 1 % up to n = 2.5, by 3 % at n = 4 and by 6 % at
-# n = 6 from 0.1 to 6 half-light radii, the light within any radius by 0.3 % at most. With 10 a
-# profile of n = 4 differs by 7 %.
+# n = 6 from 0.1 to 6 half-light radii, the light within any radius by 0.3 %, 0.5 % at n = 8. With
+# 10 a profile of n = 4 differs by 7 %.
 N_GAUSSIANS = 12
 # Parts of the light in Gaussians smaller than the first, and larger than the last.
 SMALLER, LARGER = 1e-3, 1e-4

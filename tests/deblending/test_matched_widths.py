@@ -54,3 +54,17 @@ def test_colours_inside_a_galaxy_are_no_width(size, red):
 def test_a_neighbour_hides_the_width_and_faint_light_has_none():
     assert words(0.0, wide=0.85, beside=((PLACE[0] + 7, PLACE[1]),)) == []
     assert words(0.0, wide=0.85, flux=400) == []
+
+
+@pytest.mark.parametrize("host", [1.5, 4.0, 8.0])
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_a_blue_point_in_a_red_host_is_no_width(host, share):
+    """Of its light the sharp image has a share, the other one a fifth of that."""
+    images = []
+    for k, (sigma, part) in enumerate(((SHARP, share), (WIDE, share / 5))):
+        drawn = ((PLACE, (1e5 * part,) * 2, 0.0), (PLACE, (1e5 * (1 - part),) * 2, host))
+        name, channels = ("sharp", ("g", "r")) if k == 0 else ("wide", ("i", "z"))
+        image = image_of(drawn, seed=k, sigma=sigma)
+        images.append(observed(image, sigma=sigma, name=name, channels=channels))
+    found = inspected(images, sources_of(((PLACE, None, None),), ExtendedSource)).messages
+    assert not any("than its PSF makes that of" in m for m in found)

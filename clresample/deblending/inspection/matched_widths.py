@@ -6,7 +6,8 @@ factor, if both PSFs are right. If the second one's, of width sigma, is too narr
     V = b + a (U - t . grad U + p sigma^2 laplace U),    V = P_A * d_B,    U = P_B * d_A,
 
 whatever the source's shape. Its colour may differ inside it: the size of its own light, from the
-same fit of U to a point P_A * P_B, is known in the other band to a part COLOUR only.
+same fit of U to a point P_A * P_B, is known in the other band to a part COLOUR only, and a source
+with more than MAX_SIZE of it tells nothing, as its middle may be a point of another colour.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .shifted import channels_of_light, sharpest
 
 # [1], [sigma] Smallest part p that is named, and its significance; its smallest error.
 MIN_PART, MIN_SIGMAS, FLOOR = 0.05, 5.0, 0.01
-COLOUR = 0.3
+COLOUR, MAX_SIZE = 0.3, 0.15
 # [sigma] Least light of a source whose width is compared, in either image.
 MIN_LIGHT = 100.0
 # Sources, the brightest, and channels, those of most light, that are compared.
@@ -42,14 +43,18 @@ def width_lines(images) -> list[str]:
             part, error = _mean(*_excess(one, channels_of_light(one)[0], other, c, chosen))
             if abs(part) > max(MIN_PART, MIN_SIGMAS * error):
                 wrong[other.observation.channels[c]] = part
-        for how, which, sign in (("wider", "narrow", 1), ("narrower", "wide", -1)):
+        name = one.observation.label
+        for how, which, its, sign in (
+            ("wider", "narrow", "wide", 1),
+            ("narrower", "wide", "narrow", -1),
+        ):
             some = {name: 100 * abs(part) for name, part in wrong.items() if sign * part > 0}
             if some:
                 shares = ", ".join(f"{name} by {part:.0f} %" for name, part in some.items())
                 lines.append(
-                    f"{other.observation.label}: light is {how} than its PSF makes that of "
-                    f"{one.observation.label}: in {shares} of the PSF's width; the PSF is too "
-                    f"{which}: check it, and the size of its samples (spacing)"
+                    f"{other.observation.label}: light is {how} than its PSF makes that of {name}: "
+                    f"in {shares} of the PSF's width; the PSF is too {which}, or that of {name} "
+                    f"too {its}: check both, and the sizes of their samples (spacing)"
                 )
     return lines
 
@@ -95,7 +100,8 @@ def _excess(one, c_one, other, c_other, chosen):
             away = (np.arange(n) - p for n, p in zip(planes[0].data.shape, place, strict=True))
             point = pair.light(psf_at(planes[0].psf, 0, *away))
             _, size, size_error = _fitted(point, light, disc, variance)
-            errors[k] = np.hypot(error, COLOUR * np.hypot(size, size_error))
+            if abs(size) < MAX_SIZE:
+                errors[k] = np.hypot(error, COLOUR * np.hypot(size, size_error))
     return parts, errors
 
 
