@@ -7,7 +7,8 @@ factor, if both PSFs are right. If the second one's, of width sigma, is too narr
 
 whatever the source's shape. Its colour may differ inside it: the size of its own light, from the
 same fit of U to a point P_A * P_B, is known in the other band to a part COLOUR only, and a source
-with more than MAX_SIZE of it tells nothing, as its middle may be a point of another colour.
+with more than MAX_SIZE of it, or of its light in b, tells nothing, as its middle may be a point of
+another colour.
 """
 
 from __future__ import annotations
@@ -93,20 +94,22 @@ def _excess(one, c_one, other, c_other, chosen):
         disc = good & (np.hypot(y - near[0], x - near[1]) <= pair.radius)
         if np.count_nonzero(disc) < MIN_PIXELS:
             continue
-        factor, parts[k], error = _fitted(light, there, disc, variance)
+        factor, parts[k], error, _ = _fitted(light, there, disc, variance)
         if abs(parts[k]) < MIN_PART / 2:  # whatever its error, it names nothing
             errors[k] = FLOOR
         elif factor > 0:
             away = (np.arange(n) - p for n, p in zip(planes[0].data.shape, place, strict=True))
             point = pair.light(psf_at(planes[0].psf, 0, *away))
-            _, size, size_error = _fitted(point, light, disc, variance)
-            if abs(size) < MAX_SIZE:
+            _, size, size_error, beyond = _fitted(point, light, disc, variance)
+            if max(abs(size), beyond) < MAX_SIZE:
                 errors[k] = np.hypot(error, COLOUR * np.hypot(size, size_error))
     return parts, errors
 
 
 def _fitted(light, there, disc, variance):
     """Factor a and part p of `there` against `light` over a disc, and p's error by what is left.
+
+    The last is the part of `there` in the level b, which light much wider than the disc has.
 
     variance [px^2]: of the wider PSF, over whose area the residuals are alike
     """
@@ -115,9 +118,10 @@ def _fitted(light, there, disc, variance):
     estimator = np.linalg.pinv(design.T)
     found = estimator @ there[disc]
     if not found[1]:
-        return 0.0, 0.0, np.inf
+        return 0.0, 0.0, np.inf, 0.0
     rest = there[disc] - found @ design
     alike = max(1.0, np.pi / 4 * SIGMAS_A_FWHM**2 * variance)
     scatter = alike * (rest @ rest) / max(len(rest) - len(found), 1)
     error = np.sqrt(scatter * (estimator[4] ** 2).sum()) / abs(found[1])
-    return float(found[1]), float(found[4] / found[1]), float(error)
+    level = abs(found[0]) * len(rest) / max(there[disc].sum(), 1e-30)
+    return float(found[1]), float(found[4] / found[1]), float(error), float(level)
