@@ -131,6 +131,13 @@ class GalaxyGaussians:
         factors[..., 3, 3] += self._part_slope / (2 * np.pi * self.root)
         return factors
 
+    def at(self, y, x):
+        """Brightness [1/px^2] of the first galaxy at distances y, x [px] of one shape from it."""
+        light = np.zeros(np.shape(y))
+        for peak, (yy, yx, xx) in zip(self.peak[0], self.inverse[0], strict=True):
+            light += peak * np.exp(-(yy * y * y / 2 + yx * y * x + xx * x * x / 2))
+        return light
+
     def reach(self, threshold):
         """Distance (n, 2) along y and x where profiles fall to a part (n,) of their peaks."""
         level = threshold * self.peak.sum(axis=-1)

@@ -31,6 +31,7 @@ from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
 from ..sky_level import messages_in_run
 from .group_results import SEPARATOR, GroupResults
+from .wings import continued, galaxies_beyond
 
 # Errors that concern one patch only: the others of its group continue.
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
@@ -335,6 +336,8 @@ def _take(part, job, cut, result, n_round):
         (job.mosaics.index(mosaic), box, result.model(i) - _sky(result, i))
         for i, (mosaic, box) in enumerate(_mosaics_of(job, cut.boxes))
     ]
+    if patch.siblings and result.thetas and (beyond := galaxies_beyond(result)):
+        models = [_continued(job, patch, beyond, result, i, *one) for i, one in enumerate(models)]
     part.rows.append(rows)
     thetas = [theta for own in result.thetas for theta in own]
     structures = [one for own in result.structures if patch.siblings for one in own]
@@ -364,6 +367,17 @@ def _take(part, job, cut, result, n_round):
             _ascii(SEPARATOR.join(messages_in_run(result.messages, job.mosaics))),
         )
     )
+
+
+def _continued(job, patch, beyond, result, i, i_mosaic, box, model):
+    """A model of a piece with the light of its galaxies where the pieces beside it are fitted."""
+    mosaic, region = job.mosaics[i_mosaic], box
+    for k in patch.siblings:
+        there = job.plan.patches[k].box
+        seen = mosaic.box_on(job.reference.cutout(there.y0, there.x0, there.shape))
+        region = region.union(seen) if seen.area else region
+    channels, grid = result.channel_slices()[i], result.frame.grid
+    return i_mosaic, region, continued(model, beyond, channels, box, region, mosaic, grid)
 
 
 def _sky(result, i):
