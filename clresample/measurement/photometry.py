@@ -172,8 +172,8 @@ def whole_groups(rows, bands):
     were fitted apart, its fluxes are the sums of theirs, and errors those without covariance.
     """
     _, number, count = np.unique(rows["group_id"], return_inverse=True, return_counts=True)
-    fluxes = [np.nan_to_num(rows[f"flux_{b}"]) for b in bands if f"flux_{b}" in rows]
-    faintest_first = np.argsort(np.sum(fluxes, axis=0) + np.zeros(len(number)), kind="stable")
+    fluxes = (np.nan_to_num(rows[f"flux_{b}"]) for b in bands if f"flux_{b}" in rows)
+    faintest_first = np.argsort(sum(fluxes, np.zeros(len(number))), kind="stable")
     brightest = np.zeros(len(count), int)
     brightest[number[faintest_first]] = faintest_first
     rows.put("group_id", rows["id"][brightest][number])

@@ -36,22 +36,23 @@ MIN_PIXELS = 20  # number of those pixels
 def width_lines(images) -> list[str]:
     """A message about each observation whose light has another width than a sharper one allows."""
     lines, first = [], sharpest(images)
-    one = images[first]
+    one, name = images[first], images[first].observation.label
     for i, other in enumerate(images):
-        chosen = _bright_alone(one, other) if i != first else []
-        wrong = {}
-        for c in channels_of_light(other)[:MAX_CHANNELS] if len(chosen) else ():
-            part, error = _mean(*_excess(one, channels_of_light(one)[0], other, c, chosen))
+        chosen, wrong = _bright_alone(one, other) if i != first else [], {}
+        if not len(chosen):
+            continue
+        c_one = channels_of_light(one)[0]
+        for c in channels_of_light(other)[:MAX_CHANNELS]:
+            part, error = _mean(*_excess(one, c_one, other, c, chosen))
             if abs(part) > max(MIN_PART, MIN_SIGMAS * error):
                 wrong[other.observation.channels[c]] = part
-        name = one.observation.label
         for how, which, its, sign in (
             ("wider", "narrow", "wide", 1),
             ("narrower", "wide", "narrow", -1),
         ):
-            some = {name: 100 * abs(part) for name, part in wrong.items() if sign * part > 0}
+            some = {c: 100 * abs(part) for c, part in wrong.items() if sign * part > 0}
             if some:
-                shares = ", ".join(f"{name} by {part:.0f} %" for name, part in some.items())
+                shares = ", ".join(f"{c} by {part:.0f} %" for c, part in some.items())
                 lines.append(
                     f"{other.observation.label}: light is {how} than its PSF makes that of {name}: "
                     f"in {shares} of the PSF's width; the PSF is too {which}, or that of {name} "
