@@ -39,9 +39,6 @@ example  clresample simulate field -o sky
          clresample field sky/field.toml -o sky/out
          clresample report sky/out"""
 
-# Default memory of a group of fits, as a fraction of the free memory.
-MEMORY_PART = 8
-
 
 def add_field(commands):
     """Adds `clresample field`."""
@@ -118,8 +115,8 @@ def run(arguments):
     # other threads have small matrices too: see one_blas_thread
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from ..fields.field_toml.field_file import read_field
-    from ..fields.options import MEMORY, MIN_BOUND, MIN_MEMORY, default_group_memory
-    from ..fields.run import free_memory, run_field
+    from ..fields.options import MIN_BOUND
+    from ..fields.run import run_field
     from .fields.progress import ProgressDisplay
 
     started = time.perf_counter()
@@ -137,7 +134,6 @@ def run(arguments):
         )
     devices = arguments.device.split(",") if arguments.device else []
     workers = max(arguments.workers, len(devices)) if len(devices) > 1 else arguments.workers
-    memory = min(MEMORY, free_memory() // (MEMORY_PART * max(workers, 1)))
     options = replace(
         field.options,
         workers=workers,
@@ -147,9 +143,6 @@ def run(arguments):
         part=arguments.part,
         hats=arguments.hats,
         worker_memory=arguments.worker_memory,
-        group_memory=default_group_memory(arguments.worker_memory)
-        if arguments.worker_memory
-        else max(memory, MIN_MEMORY),
     )
     progress = ProgressDisplay(arguments)
     try:

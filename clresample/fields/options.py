@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
 
 LOG = logging.getLogger("clresample")
-# [bytes] of one group of fits: more lets more blends share a batch
-MEMORY = 1 << 30
+# [bytes] of one group of fits: more lets more blends share a batch. By default less, the part of
+# the free memory below for each worker.
+MEMORY, MEMORY_PART = 1 << 30, 1 / 8
 # [bytes] of a worker process: libraries, compiler and one small group take some 600 MiB
 MIN_BOUND = 1 << 30
 MIN_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
@@ -39,8 +41,9 @@ class FieldOptions:
         Blends that extend beyond the border are fitted without the sources beyond it
     tile_px [model px]: largest side of a tile of the search; overlap_px [model px]: of tiles
     limits: of one fit; larger blends are cut
-    group_memory [bytes]: limit for a group of fits, and for the search of a tile, in a worker; a
-        resumed run keeps the value of the first run
+    group_memory [bytes]: limit for a group of fits and for the search of a tile in a worker, and
+        for each fit, besides `limits`; None = by `worker_memory`, else for groups alone, by the
+        free memory: blends are not cut by it. A resumed run keeps the value of the first run
     worker_memory [bytes]: limit on the private memory of a worker process, enforced by the system
         (Linux); None = no limit. A group that exceeds it is fitted in halves, then one by one
     workers: processes; 0 = this one. task_timeout_s [s]: longest time of a group, None = no limit
@@ -61,7 +64,7 @@ class FieldOptions:
     tile_px: int = 1024
     overlap_px: int = 96
     limits: FitLimits = FitLimits()
-    group_memory: int = MEMORY
+    group_memory: int | None = None
     worker_memory: int | None = None
     workers: int = 0
     task_timeout_s: float | None = None
@@ -79,7 +82,7 @@ class FieldOptions:
             raise ValueError(f"field_number is {self.field_number}, must be 0 to {LARGEST_FIELD}")
         if self.workers < 0:
             raise ValueError(f"workers is {self.workers}, must be 0 or more")
-        if not self.group_memory >= MIN_MEMORY:
+        if self.group_memory is not None and not self.group_memory >= MIN_MEMORY:
             raise ValueError(f"group_memory is {self.group_memory} bytes, must be 64 MiB or more")
         if self.worker_memory is not None and not self.worker_memory >= MIN_BOUND:
             raise ValueError(f"worker_memory is {self.worker_memory} bytes, must be 1 GiB or more")
@@ -93,14 +96,29 @@ class FieldOptions:
             return tuple(self.device)
         return () if self.device is None else (self.device,)
 
+    def with_memory(self) -> FieldOptions:
+        """The same with `group_memory`, and the limit of a fit that follows from what was asked.
 
-def default_group_memory(bound) -> int:
-    """Memory [bytes] of a group of fits by prediction, in a process that may take `bound` in all.
+        Of `worker_memory` groups get half of what the libraries leave: predictions are rough, and a
+        group's results need host memory in addition to the device's.
+        """
+        memory = self.group_memory
+        if memory is None and self.worker_memory is not None:
+            memory = min(MEMORY, (self.worker_memory - MIN_BOUND // 2) // 2)
+        if memory is None:
+            n_workers = max(self.workers, len(self.devices), 1)
+            free = int(_free_memory() * MEMORY_PART / n_workers)
+            return replace(self, group_memory=max(MIN_MEMORY, min(MEMORY, free)))
+        max_bytes = min(self.limits.max_bytes, memory)
+        return replace(self, group_memory=memory, limits=replace(self.limits, max_bytes=max_bytes))
 
-    Half of the memory beside its libraries: predictions are rough, and a group's results need host
-    memory in addition to the device's.
-    """
-    return max(MIN_MEMORY, min(MEMORY, (bound - MIN_BOUND // 2) // 2))
+
+def _free_memory() -> int:
+    """Free memory [bytes] of this machine; 2 GiB if unknown."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return 2 << 30
 
 
 @dataclass(eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import time
 from dataclasses import dataclass, field, replace
@@ -71,7 +70,7 @@ def run_field(
     mosaics, folder = _as_sent(check_sequence("mosaics", mosaics, Mosaic)), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_grid(mosaics)
-    options = replace(options, positions=_degrees(options.positions, reference))
+    options = replace(options.with_memory(), positions=_degrees(options.positions, reference))
     _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
@@ -94,7 +93,7 @@ def run_field(
     try:
         prepare_search(mosaics, reference, work, engine)
         memory = max(MIN_MEMORY, min(options.group_memory, read_search_setup(work).memory))
-        options = replace(options, group_memory=memory)
+        options = replace(options, group_memory=_power_of_two(memory))
         plan = load_or_make_plan(
             mosaics, reference, region, core, work, options, engine, progress, clock
         )
@@ -171,9 +170,6 @@ class _Clock:
         self.seconds[stage], self.since = now - self.since, now
 
 
-def free_memory() -> int:
-    """Free memory [bytes] of this machine; 2 GiB if unknown."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return 2 << 30
+def _power_of_two(n) -> int:
+    """The largest power of two up to n: groups are alike where the free memory is nearly so."""
+    return 1 << (int(n).bit_length() - 1)

@@ -347,6 +347,19 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
         FieldOptions(device=[])
 
 
+@pytest.mark.parametrize("free", [1 << 30, 5 << 30, 100 << 30])
+def test_blends_are_cut_alike_whatever_memory_is_free(free, monkeypatch):
+    monkeypatch.setattr(options, "_free_memory", lambda: free)
+    for workers in (0, 2, 16):
+        given = FieldOptions(workers=workers).with_memory()
+        assert given.limits == FitLimits()
+        assert options.MIN_MEMORY <= given.group_memory <= free / (8 * max(workers, 1)) + (1 << 26)
+    asked = FieldOptions(worker_memory=2 << 30).with_memory()
+    assert asked.limits.max_bytes == asked.group_memory == 3 << 28
+    asked = FieldOptions(group_memory=1 << 28, worker_memory=4 << 30).with_memory()
+    assert asked.limits.max_bytes == asked.group_memory == 1 << 28
+
+
 def test_groups_shrink_with_the_device_and_leave_the_same_sources(sky, tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "STEP_PX", 32)  # so that this small field has groups of several
     folder, tmp_path = tmp_path / "all", tmp_path / "few"

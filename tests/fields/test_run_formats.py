@@ -27,7 +27,7 @@ def test_a_run_of_another_format_is_refused_and_kept(tmp_path, resume):
     (work / "run.json").write_text(json.dumps({"settings": "..."}))
     with pytest.raises(FileError) as error:
         opened(tmp_path, resume=resume)
-    assert "holds a run of format 1, this version goes on with 13: --overwrite" in str(error.value)
+    assert "holds a run of format 1, this version goes on with 14: --overwrite" in str(error.value)
     assert "\n" not in str(error.value)
     assert [path.name for path in work.iterdir()] == ["run.json"]
 
@@ -36,5 +36,5 @@ def test_a_run_of_another_format_is_overwritten_where_that_is_asked_for(tmp_path
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "run.json").write_text(json.dumps({"format": 1}))
     opened(tmp_path, overwrite=True)
-    assert json.loads((tmp_path / "work" / "run.json").read_text())["format"] == 13
+    assert json.loads((tmp_path / "work" / "run.json").read_text())["format"] == 14
     opened(tmp_path)  # its own goes on

@@ -28,33 +28,32 @@ class FitLimits:
         errors' normal matrix with the square of the number of sources, its inverse with the cube
     work [px]: model pixels times sources above which a blend is also cut where the light between
         its parts is weak (WEAK); smaller blends are cut only over the limits above
-    max_bytes [bytes]: largest predicted memory, see `fit_bytes`; None = any
+    max_bytes [bytes]: largest predicted memory, see `fit_bytes`. A number of its own, not what is
+        free: blends are cut alike in each run
     n_channels: of all mosaics, for that prediction
     """
 
     max_sources: int = 40
     max_pixels: int = 400 * 400
     work: int = 1_000_000
-    max_bytes: float | None = None
+    max_bytes: float = 1 << 30
     n_channels: int = 1
 
     def __post_init__(self):
-        for name in ("max_sources", "max_pixels", "work"):
+        for name in ("max_sources", "max_pixels", "work", "max_bytes"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
 
     @property
     def most_pixels(self) -> float:
         """Of the box of a single source."""
-        if self.max_bytes is None:
-            return self.max_pixels
         return min(self.max_pixels, self.max_bytes / fit_bytes(1, 1, self.n_channels))
 
     def allow(self, n_sources, n_pixels) -> bool:
         """Returns True if numbers of sources and pixels are within the limits."""
         n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
         few = n_sources <= self.max_sources and n_pixels <= self.max_pixels
-        return few and (self.max_bytes is None or n_bytes <= self.max_bytes)
+        return few and n_bytes <= self.max_bytes
 
     def quick(self, n_sources, n_pixels) -> bool:
         """Returns True if a fit of this size is within `work` too."""

@@ -177,7 +177,7 @@ def make_fit_plan(
         permit it
     stars (S,): bool, see TileDetections; None = no source is one
     """
-    limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
+    limits = replace(limits or FitLimits(), n_channels=n_channels)
     ids = source_ids(positions, field_number)
     hosts = ids if hosts is None else host_ids(positions, peaks, ids, hosts)
     labels, corner = footprints.labels, np.array(region[:2])

@@ -13,14 +13,15 @@ from ..sky_level import FILE as SKY_FILE
 from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
-FORMAT = 13  # of that folder; raised when another version would misread it
+FORMAT = 14  # of that folder; raised when another version would misread it
+MEMORY = "memory", "max_bytes"  # keys of it that a resumed run takes from the first one
 
 
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
     """Creates or reopens the folder of group results; returns it and the options.
 
     The returned options have the memory of the earlier run, because it determines which blends are
-    fitted side by side.
+    fitted side by side, and which are cut.
 
     inputs: files whose sizes and times must be unchanged in a resumed run
 
@@ -36,7 +37,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         if not resume:
             raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
         before = json.loads(there.read_text())
-        other = [key for key in mine if key != "memory" and before.get(key) != mine[key]]
+        other = [key for key in mine if key not in MEMORY and before.get(key) != mine[key]]
         if other:
             raise FileError(
                 f"{folder}: holds a run with another {other[0]}, {before.get(other[0])!r} and not "
@@ -44,7 +45,8 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
             )
         progress.message(f"going on with the run in {folder}")
         remove_stale(work)  # files in the midst of which it was killed
-        return work, replace(options, group_memory=before["memory"])
+        limits = replace(options.limits, max_bytes=before["max_bytes"])
+        return work, replace(options, group_memory=before["memory"], limits=limits)
     try:
         work.mkdir(parents=True, exist_ok=True)
         (work / SKY_FILE).unlink(missing_ok=True)  # of a start that ended before the search
@@ -82,6 +84,7 @@ def _fingerprint(mosaics, reference, options, inputs):
         "overlap_px": options.overlap_px,
         "limits": [options.limits.max_sources, options.limits.max_pixels],
         "memory": options.group_memory,
+        "max_bytes": options.limits.max_bytes,
         "field_number": options.field_number,
         "inputs": {str(f): _size_and_time(f) for f in inputs},
     }
