@@ -51,6 +51,8 @@ COMPONENT_SPREAD = 1.0
 NO_LIGHT = 46
 # Newton's steps to the distance of a brightness.
 N_NEWTON = 6
+# Galaxies whose Gaussians are kept, of 5 KB each: those of the blends of a batch.
+N_GALAXIES = 1024
 # [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 # Aliased waves of a star are drawn down to this multiple of the light at which galaxies end, a
@@ -157,6 +159,21 @@ class GalaxyGaussians:
         return np.exp(-np.square(r)[..., None] / (2 * self.root))
 
 
+def one_galaxy(parameters, psf_moment):
+    """The GalaxyGaussians (1, K) of a galaxy, kept: its box, image and errors need them in turn.
+
+    parameters (4,), psf_moment (2, 2)
+    """
+    return _one_galaxy(*(np.asarray(a, float).tobytes() for a in (parameters, psf_moment)))
+
+
+@functools.lru_cache(maxsize=N_GALAXIES)
+def _one_galaxy(parameters, psf_moment):
+    return GalaxyGaussians(
+        np.frombuffer(parameters)[None], np.frombuffer(psf_moment).reshape(1, 2, 2)
+    )
+
+
 def _distance(variance, part, level):
     """Distance r (n,) where the sum of part exp(-r^2 / (2 variance)) over K falls to `level`.
 
@@ -197,7 +214,7 @@ def profile(parameters, position, shape, psf_moment, *, slopes=True, moved=False
     The profile alone (1, ny, nx) without `slopes`; if `moved`, those by the position (y, x) [px]
     too, (7, ny, nx).
     """
-    some = GalaxyGaussians(np.asarray(parameters)[None], np.asarray(psf_moment)[None])
+    some = one_galaxy(parameters, psf_moment)
     (peak,), (inverse,) = some.peak, some.inverse
     y, x = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
     y, x = (a.ravel() for a in np.broadcast_arrays(y[:, None], x))
@@ -350,8 +367,7 @@ class GalaxyProfile(ComponentProfile):
 
     def bounding_box(self, theta, position, threshold):
         """Its ellipse where the profile falls to the threshold."""
-        half = galaxy_reach(np.array([theta]), self.psf_moment[None], np.array([threshold]))
-        return position, half[0]
+        return position, one_galaxy(theta, self.psf_moment).reach(np.array([threshold]))[0]
 
 
 class FixedProfile(ComponentProfile):

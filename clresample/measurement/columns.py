@@ -158,11 +158,12 @@ class Columns:
         """The same as an astropy table, with the descriptions of its columns."""
         table = QTable(
             [
-                values if name not in self.units else values * self.units[name]
+                values.copy() if name not in self.units else values * self.units[name]
                 for name, values in self.values.items()
             ],
             names=list(self.values),
             meta=self.meta,
+            copy=False,
         )
         for name in table.colnames:
             table[name].info.description = definition(name).description or None

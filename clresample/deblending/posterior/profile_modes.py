@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.box import box_slices
-from ..profiles import SIZE_SCATTER, GalaxyGaussians, GalaxyProfile, StarProfile
+from ..profiles import SIZE_SCATTER, GalaxyProfile, StarProfile, one_galaxy
 from .moments import light_sums
 
 # Scatter of galaxies in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, for errors: n = 1 is
@@ -70,7 +70,7 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
 def _surroundings(galaxy, theta, position, origin, size):
     """Window around a galaxy's box for the light beyond it: first pixel (2,), size (2,)."""
     near = np.minimum(np.array(size) // 2, FAR_PX)
-    (level,) = GalaxyGaussians(theta[None], galaxy.psf_moment[None]).threshold(FAR_LIGHT)
+    (level,) = one_galaxy(theta, galaxy.psf_moment).threshold(FAR_LIGHT)
     frame, (middle, half) = np.array(galaxy.shape), galaxy.bounding_box(theta, position, level)
     low = np.minimum(origin - near, np.maximum(np.floor(middle - half), 0))
     high = np.maximum(origin + size + near, np.minimum(np.ceil(middle + half) + 1, frame))

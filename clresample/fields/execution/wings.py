@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...deblending.linear.equations import N_PARAMETERS
-from ...deblending.profiles import GalaxyGaussians, profile, psf_second_moment
+from ...deblending.profiles import one_galaxy, profile, psf_second_moment
 
 # [1] Least part of a galaxy's light beyond the frame that is continued.
 MIN_BEYOND = 0.001
@@ -23,7 +23,7 @@ def galaxies_beyond(result):
         if len(theta) != N_PARAMETERS:
             continue
         place = np.array(result.sources[c.source].position_px)
-        some = GalaxyGaussians(np.array([theta]), moment[None])
+        some = one_galaxy(theta, moment)
         edge = np.minimum(place, np.array(result.frame.shape) - 1 - place).min()
         if some.outside(max(edge, 0.0)) < MIN_BEYOND:
             continue
