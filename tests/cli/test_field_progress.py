@@ -52,12 +52,12 @@ def test_a_terminal_shows_blends_sources_a_second_and_the_time_left(live):
     assert "about 12 s left" in text  # 24 blends at 2 a second
     shown.time_left(47)
     clock.now += 5
-    assert shown.speed() == "2.2 sources/s, about 42 s left"
+    assert shown.speed() == "2.2 sources/s, about 42 s left in this stage"
     shown.stage("pieces", 4)
     shown.time_left(3)
-    assert "about 3 s left" in stream.getvalue() and shown.speed() == "about 3 s left"
+    assert "about 3 s left" in stream.getvalue() and shown.speed() == "about 3 s left in this stage"
     clock.now += 4
-    assert shown.speed() == "about 0 s left"
+    assert shown.speed() == "about 0 s left in this stage"
     shown.message("3 blends are set aside")
     shown.dashboard("http://127.0.0.1:8787\x1b[2J")
     lines = stream.getvalue().replace("\r", "\n").splitlines()
@@ -73,7 +73,7 @@ def test_a_log_gets_a_line_now_and_then(live):
     assert stream.getvalue() == ""
     clock.now += LINE_S + 1
     shown.step(1, 24)
-    line = f"search: 2 of 4 tiles, {31 / (LINE_S + 1):.1f} sources/s, about 31 s left"
+    line = f"search: 2 of 4 tiles, {31 / (LINE_S + 1):.1f} sources/s, about 31 s left in this stage"
     assert stream.getvalue() == f"clresample field: {line}\n"
     shown.step(1, 5)
     assert stream.getvalue().count("\n") == 1

@@ -79,10 +79,10 @@ class ProgressDisplay(RunProgress):
             words.append(f"{self.sources / seconds:.1f} sources/s")
         if self.ends is not None:
             left = max(0.0, self.ends - self.clock())
-            words.append(f"about {duration(left)} left")
+            words.append(f"about {duration(left)} left in this stage")
         elif words:  # by the number of tiles, which are alike
             left = (self.total - self.done) * seconds / self.counted
-            words.append(f"about {duration(left)} left")
+            words.append(f"about {duration(left)} left in this stage")
         return ", ".join(words)
 
     def message(self, text):
