@@ -58,7 +58,8 @@ class Channel:
     name: of the channel, unique over all mosaics
     data [counts]: plane of the image
     weight: plane, or None; weight_kind: what it holds, "weight" [counts^-2], "variance" [counts^2]
-        or "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
+        or "rms" [counts], the standard deviation; 0, negative, NaN and infinite ones mean: ignore
+        this pixel
     mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
     zero_point [mag]: AB magnitude of one count; None = unknown
     background: what is subtracted, or None
@@ -94,7 +95,7 @@ class Channel:
         if self.weight_kind == "weight":
             bad = ~np.isfinite(values) | (values < 0)
         else:
-            variance = values**2 if self.weight_kind == "rms" else values
+            variance = rms_squared(values) if self.weight_kind == "rms" else values
             good = (variance >= np.finfo(np.float64).tiny) & (variance < np.inf)  # no NaN is
             values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
             if self.mask is None:
@@ -131,6 +132,14 @@ class Channel:
             return np.zeros(box.shape, bool)
         flags = np.nan_to_num(self.mask.read(box))
         return flags != 0 if self.mask_value is None else _set(flags, self.mask_value)
+
+
+def rms_squared(values):
+    """Variances of standard deviations; negative ones, which mean that there are no data, stay so.
+
+    values: array
+    """
+    return values * np.abs(values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,6 +87,15 @@ def test_weights_come_from_weights_variances_and_rms_and_bits_of_the_mask(image)
         assert np.allclose(weights[weights > 0], 0.25)
 
 
+def test_a_negative_rms_is_no_noise(image):
+    sigma = np.full(SHAPE, 2.0)
+    sigma[3, 4:6] = -1, -2
+    made = channel(image, weight=ArrayPlane(sigma), weight_kind="rms")
+    weights = made.weights(Box(0, 0, 10, 10))
+    assert np.argwhere(weights == 0).tolist() == [[3, 4], [3, 5]]
+    assert (weights[weights > 0] == 0.25).all()
+
+
 def test_an_observation_is_the_box_with_its_own_wcs_and_psf(image):
     whole, psf = grid(angle_deg=12.0), PSF.gaussian(1.5)
     mosaic = Mosaic.of_arrays("m", image, whole, psf, weights=1.0, zero_points=[25.0])

@@ -166,6 +166,30 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
     np.testing.assert_allclose(o.weights[:, 0, 0], [1 / 4, 1 / 5])
 
 
+@pytest.mark.parametrize("names", ["gri", "irg", "igr"])
+@pytest.mark.parametrize("bands", ["", 'bands = ["i", "r", "g"]', 'bands = ["r", "i"]'])
+def test_cubes_that_name_their_bands_are_matched_by_name(folder, names, bands):
+    widths, variances = {"g": 1.4, "r": 1.5, "i": 1.6}, {"g": 3.0, "r": 4.0, "i": 5.0}
+    header = fits.Header({f"BAND{i + 1}": name for i, name in enumerate(names)})
+    psf = PSF.gaussian([widths[name] for name in names], n_pixels=21).images
+    with fits.open(folder / "cube.fits") as hdus:
+        planes = np.ones(hdus[0].shape) * np.array([variances[n] for n in names])[:, None, None]
+    fits.PrimaryHDU(psf, header).writeto(folder / "named_psf.fits", overwrite=True)
+    fits.PrimaryHDU(planes, header).writeto(folder / "named_variance.fits", overwrite=True)
+    text = CUBE.replace("psf3", "named_psf") + bands + '\nvariance = "named_variance.fits"'
+    (o,) = scene(folder, text).observations
+    expected = PSF.gaussian([widths[name] for name in o.channels], n_pixels=21).images
+    np.testing.assert_allclose(o.psf.images, expected)
+    np.testing.assert_allclose(o.weights[:, 0, 0], [1 / variances[n] for n in o.channels])
+
+
+@pytest.mark.parametrize("key", ["variance = [3, 4, 5]", 'psf = ["psf.fits", "psf.fits"]'])
+def test_lists_beside_bands_in_another_order_are_refused(folder, key):
+    text = CUBE if "psf" not in key else CUBE.replace('psf = "psf3.fits"', "")
+    with pytest.raises(ValueError, match="bands puts all planes of the images into another order"):
+        scene(folder, text + key + '\nbands = ["i", "r", "g"]')
+
+
 @pytest.mark.parametrize(
     "text, message",
     [
@@ -295,3 +319,12 @@ def test_pixels_may_be_those_of_an_observation(folder, tmp_path):
     assert found[0].position_px == (4.0, 5.0)
     on_sky = read_sources(tmp_path / "list.ecsv", {"ra": "ra", "observation": "image"})
     assert [s.observation for s in on_sky] == [None, None]
+
+
+def test_a_negative_rms_gives_a_pixel_no_weight(folder):
+    rms = np.full((30, 34), 2.0)
+    rms[4, 5:7] = -1, -2
+    fits.PrimaryHDU(rms).writeto(folder / "rms.fits", overwrite=True)
+    (o,) = scene(folder, ONE + 'rms = "rms.fits"').observations
+    assert np.argwhere(o.weights[0] == 0).tolist() == [[4, 5], [4, 6]]
+    np.testing.assert_allclose(o.weights[o.weights > 0], 0.25)

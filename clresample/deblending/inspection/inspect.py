@@ -161,8 +161,8 @@ def _unmeasured(image):
     if not names:
         return []
     return [
-        f"no pixel of {', '.join(names)} has a weight: fluxes there are NaN; check weights or "
-        "variance for NaN, or leave the channel out"
+        f"no pixel of {', '.join(names)} has a weight: nothing is measured there; check weights "
+        "or variance for NaN, or leave the channel out"
     ]
 
 

@@ -41,11 +41,30 @@ class Images(NamedTuple):
 
 
 class BandSelection(NamedTuple):
-    """Planes of the images in use: `chosen` of `n_all`; shape (Ny, Nx) of each."""
+    """Planes of the images in use: `chosen` of those with `names`; shape (Ny, Nx) of each."""
 
-    n_all: int
+    names: list
     chosen: list
     shape: tuple
+
+    @property
+    def n_all(self):
+        """Number of the images' planes."""
+        return len(self.names)
+
+    def in_cube(self, names):
+        """Planes (n,) of a cube with these names that belong to the channels, None if unknown."""
+        own = [self.names[i] for i in self.chosen]
+        known = len(set(names)) == len(names) > 1 and not any(name.isdigit() for name in own)
+        return [names.index(name) for name in own] if known and set(own) <= set(names) else None
+
+    def check_list(self, key):
+        """Raises ValueError for a key that lists files or numbers if their order is not clear."""
+        if len(self.chosen) == self.n_all and self.chosen != list(range(self.n_all)):
+            raise ValueError(
+                f"{key} is a list, and bands puts all planes of the images into another order: "
+                "leave out bands, and give each list in the order of the images' planes"
+            )
 
 
 class ImageFiles:
@@ -136,7 +155,7 @@ class ImageFiles:
         own = [self.folder / one for one in as_list(self.table["image"])]
         if hdu is not None and not any(isinstance(one, str) for one in given):
             raise ValueError(f"{key}_hdu is given, but {key} names no file")
-        found = []
+        found, names = [], []
         for k, one in enumerate(given):
             if not isinstance(one, str):
                 found.append((ConstantPlane(float(one)), None))
@@ -150,9 +169,15 @@ class ImageFiles:
             with open_fits(path) as hdus:
                 chosen = choose_hdu(path, hdus, hdu)
                 header, size = chosen.header.copy(), chosen.shape[-2:]
-                found += [(plane, header) for plane in self._planes(path, hdus, chosen, 0)]
+                planes = self._planes(path, hdus, chosen, 0)
+                found += [(plane, header) for plane in planes]
+                names = band_names(header, len(planes))
             if size != bands.shape:
                 raise ValueError(f"{key} has {size} pixels ({path}), the images {bands.shape}")
+        if len(given) > 1:
+            bands.check_list(key)
+        elif (own := bands.in_cube(names)) is not None:
+            return [found[i] for i in own]
         return _for_channels(key, found, bands)
 
     def _planes(self, path, hdus, hdu, axis):

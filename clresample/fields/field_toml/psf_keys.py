@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 
 from ...files.atomic import FileError
+from ...files.fits import band_names, choose_hdu, open_fits
 from ...sky.psf_checks import PSFWarning, check_edge
 from ..psfs.combined import ConstantPSF, PerBandPSF
 from ..psfs.psfex import PSFExPSF
@@ -31,7 +32,12 @@ def read_psf_keys(folder, table, grid, header, bands, inputs, notes):
     form, name = table.get("psf_format", "image"), table["name"]
     given = _given(table, form)
     files = table["psf"] if isinstance(table["psf"], list) else [table["psf"]]
-    found = []
+    found, named = [], False
+    if bands is not None and len(files) > 1:
+        bands.check_list("psf")
+    elif bands is not None and form == "image" and "psf_bands" not in table:
+        own = bands.in_cube(_band_names(folder / files[0], given["hdu"]))
+        given, named = given | {"bands": own}, own is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PSFWarning)  # reported in the notes
         for k, one in enumerate(files):
@@ -41,7 +47,7 @@ def read_psf_keys(folder, table, grid, header, bands, inputs, notes):
             if form == "image":
                 _check(folder / one, found[-1].psf)
     psf = found[0] if len(found) == 1 else PerBandPSF(found)
-    if bands is not None:
+    if bands is not None and not named:
         psf = _of_bands(psf, table, bands)
     if not psf.varies:
         return psf
@@ -70,6 +76,13 @@ def _given(table, form):
         if "psf_origin_px" in table:
             given["origin_px"] = table["psf_origin_px"]
     return given
+
+
+def _band_names(path, hdu):
+    """Names of the planes of a PSF's image or cube."""
+    with open_fits(path) as hdus:
+        chosen = choose_hdu(path, hdus, hdu)
+        return band_names(chosen.header, chosen.shape[0] if len(chosen.shape) == 3 else 1)
 
 
 def _check(path, psf):

@@ -30,7 +30,7 @@ from ...sky.noise import NoiseWarning
 from ...sky.observation import Observation, check_observations
 from ...sky.psf_checks import PSFWarning
 from ...sky.sources import Source
-from ..mosaic import saturations
+from ..mosaic import rms_squared, saturations
 from .estimates import subtract_background
 from .keys import parse_scene
 from .mosaic_file import open_mosaic
@@ -125,7 +125,7 @@ def _observation(mosaic, table, calibrated):
         given["mask"] = np.stack([c.masked(box) for c in channels])
     if channels[0].weight is not None:
         values = np.stack([_values(c.weight, box) for c in channels])
-        values = values**2 if channels[0].weight_kind == "rms" else values
+        values = rms_squared(values) if channels[0].weight_kind == "rms" else values
         given["weights" if channels[0].weight_kind == "weight" else "variance"] = values
     if calibrated:
         given["zero_points"] = [c.zero_point for c in channels]
