@@ -31,31 +31,25 @@ def _hills(light, inside):
 
     A hill is the set of pixels from which the steepest ascent ends at the same peak.
     """
-    n_y, n_x = light.shape
-    kind = np.int32 if light.size < 1 << 31 else np.int64
-    rank = np.empty(light.size, kind)  # of equal pixels the later is higher: no plateaus
-    own = np.arange(light.size, dtype=kind)
-    rank[np.argsort(light, axis=None, kind="stable")] = own
-    own, rank = own.reshape(light.shape), rank.reshape(light.shape)
-    rank[~inside] = -1
-    rank = np.pad(rank, 1, constant_values=-1)
-    best, up = rank[1:-1, 1:-1].copy(), own.copy()
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            there = rank[1 + dy : 1 + dy + n_y, 1 + dx : 1 + dx + n_x]
-            higher = inside & (there > best)
-            up[higher] = own[higher] + dy * n_x + dx
-            best[higher] = there[higher]
-    up = up.ravel()
+    inside, width = np.asarray(inside, bool), light.shape[1] + 2
+    order = np.argsort(light[inside], kind="stable")  # of equal pixels the later is higher
+    n = len(order)
+    kind = np.int32 if n < 1 << 31 else np.int64
+    at = np.flatnonzero(np.pad(inside, 1))
+    rank = np.full((light.shape[0] + 2) * width, -1, kind)
+    rank[at[order]] = np.arange(n, dtype=kind)
+    best = rank[at]
+    for away in (-width - 1, -width, 1 - width, -1, 1, width - 1, width, width + 1):
+        np.maximum(best, rank[at + away], out=best)
+    up = order[best]  # the highest neighbour of each pixel inside, among these
     while (up[up] != up).any():  # halves the ways each time
         up = up[up]
-    up = up[inside.ravel()]
-    is_top = np.zeros(light.size, bool)
+    is_top = np.zeros(n, bool)
     is_top[up] = True
     number = np.cumsum(is_top, dtype=np.int32)
     found = np.zeros(light.shape, np.int32)
     found[inside] = number[up]
-    return found, int(number[-1])
+    return found, int(is_top.sum())
 
 
 def saddles(light, basins, *, heights=False):
@@ -63,16 +57,13 @@ def saddles(light, basins, *, heights=False):
 
     heights: whether to return (pairs, that light of each) instead
     """
-    pairs, lights = [], []
-    for first, second in (
-        (np.s_[:-1, :], np.s_[1:, :]),
-        (np.s_[:, :-1], np.s_[:, 1:]),
-        (np.s_[:-1, :-1], np.s_[1:, 1:]),
-        (np.s_[:-1, 1:], np.s_[1:, :-1]),
-    ):
-        a, b = basins[first], basins[second]
-        touch = (a != b) & (a > 0) & (b > 0)
-        lights.append(np.minimum(light[first], light[second])[touch])
+    width, pairs, lights = light.shape[1] + 2, [], []
+    own, height = (np.pad(image, 1).ravel() for image in (basins, light))
+    at = np.flatnonzero(own > 0)
+    for away in (width, 1, width + 1, width - 1):
+        a, b = own[at], own[at + away]
+        touch = (a != b) & (b > 0)
+        lights.append(np.minimum(height[at[touch]], height[at[touch] + away]))
         pairs.append(np.sort(np.stack([a[touch], b[touch]], axis=1) - 1, axis=1))
     both, height = np.concatenate(pairs), np.concatenate(lights)
     order = np.lexsort((both[:, 1], both[:, 0], -height))

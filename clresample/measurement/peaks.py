@@ -96,7 +96,10 @@ def _without_structure(image, threshold, point_area, peaks, segments, first):
         return peaks, segments
     inside, number = image > threshold, np.arange(len(peaks) + 1)
     tops = np.where(ndimage.maximum_filter(image, 3) == image, image, 0)
-    at = np.array(ndimage.maximum_position(tops, segments, number[1:]), int)
+    lit = np.flatnonzero(segments)
+    given = tops.ravel()[lit], segments.ravel()[lit], number[1:]
+    top = lit[np.array(ndimage.maximum_position(*given), int)[:, 0]]
+    at = np.stack(np.unravel_index(top, image.shape), axis=1)
     height = tops[at[:, 0], at[:, 1]].astype(float)
     base = _saddle_heights(image, inside, at, height)
     above = image - np.concatenate([[0], np.maximum(base, threshold)])[segments]
