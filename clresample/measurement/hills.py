@@ -31,7 +31,7 @@ def _hills(light, inside):
 
     A hill is the set of pixels from which the steepest ascent ends at the same peak.
     """
-    inside, width = np.asarray(inside, bool), light.shape[1] + 2
+    width = light.shape[1] + 2
     order = np.argsort(light[inside], kind="stable")  # of equal pixels the later is higher
     n = len(order)
     kind = np.int32 if n < 1 << 31 else np.int64

@@ -74,14 +74,14 @@ class ProgressDisplay(RunProgress):
     def speed(self):
         """Sources a second and the time left, as far as they are known."""
         seconds = self.clock() - self.began
-        words = []
+        words, left = [], None
         if self.counted and seconds > 0:
             words.append(f"{self.sources / seconds:.1f} sources/s")
+            # by the number of tiles, which are alike
+            left = (self.total - self.done) * seconds / self.counted
         if self.ends is not None:
             left = max(0.0, self.ends - self.clock())
-            words.append(f"about {duration(left)} left in this stage")
-        elif words:  # by the number of tiles, which are alike
-            left = (self.total - self.done) * seconds / self.counted
+        if left is not None:
             words.append(f"about {duration(left)} left in this stage")
         return ", ".join(words)
 

@@ -14,7 +14,7 @@ from .search_setup import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
 FORMAT = 14  # of that folder; raised when another version would misread it
-MEMORY = "memory", "max_bytes"  # keys of it that a resumed run takes from the first one
+MEMORY_KEYS = "memory", "max_bytes"  # keys of it that a resumed run takes from the first one
 
 
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
@@ -37,7 +37,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         if not resume:
             raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
         before = json.loads(there.read_text())
-        other = [key for key in mine if key not in MEMORY and before.get(key) != mine[key]]
+        other = [key for key in mine if key not in MEMORY_KEYS and before.get(key) != mine[key]]
         if other:
             raise FileError(
                 f"{folder}: holds a run with another {other[0]}, {before.get(other[0])!r} and not "

@@ -32,12 +32,7 @@ def read_psf_keys(folder, table, grid, header, bands, inputs, notes):
     form, name = table.get("psf_format", "image"), table["name"]
     given = _given(table, form)
     files = table["psf"] if isinstance(table["psf"], list) else [table["psf"]]
-    found, named = [], False
-    if bands is not None and len(files) > 1:
-        bands.check_list("psf")
-    elif bands is not None and form == "image" and "psf_bands" not in table:
-        own = bands.in_cube(_band_names(folder / files[0], given["hdu"]))
-        given, named = given | {"bands": own}, own is not None
+    found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PSFWarning)  # reported in the notes
         for k, one in enumerate(files):
@@ -47,8 +42,13 @@ def read_psf_keys(folder, table, grid, header, bands, inputs, notes):
             if form == "image":
                 _check(folder / one, found[-1].psf)
     psf = found[0] if len(found) == 1 else PerBandPSF(found)
-    if bands is not None and not named:
-        psf = _of_bands(psf, table, bands)
+    if bands is not None:
+        names = []
+        if len(files) > 1:
+            bands.check_list("psf")
+        elif form == "image":
+            names = _band_names(folder / files[0], given["hdu"])
+        psf = _of_bands(psf, table, bands, names)
     if not psf.varies:
         return psf
     origin = _origin(table, form, header, grid, found[0], notes)
@@ -92,12 +92,17 @@ def _check(path, psf):
         raise FileError(f"{path}: {error}") from error
 
 
-def _of_bands(psf, table, bands):
-    """The PSF of the bands that are taken. Raises ValueError where their numbers disagree."""
+def _of_bands(psf, table, bands, names):
+    """The PSF of the bands that are taken. Raises ValueError where their numbers disagree.
+
+    names: of the planes of a cube
+    """
     n = len(bands.chosen)
     all_bands = psf.n_bands == bands.n_all and n != bands.n_all
-    if isinstance(psf, ConstantPSF) and psf.n_bands == bands.n_all and "psf_bands" not in table:
-        return ConstantPSF(psf.psf.select(bands.chosen))
+    if isinstance(psf, ConstantPSF) and "psf_bands" not in table:
+        own = bands.in_cube(names)
+        if own is not None or psf.n_bands == bands.n_all:
+            return ConstantPSF(psf.psf.select(bands.chosen if own is None else own))
     if psf.n_bands not in (1, n) or all_bands:
         raise ValueError(
             f"psf has {psf.n_bands} bands, the image {n}: choose with bands and psf_bands"
