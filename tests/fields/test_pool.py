@@ -83,6 +83,14 @@ def test_all_workers_begin_before_they_are_asked(tmp_path):
         assert begun == {child.pid for child in multiprocessing.active_children()}
 
 
+def test_idle_workers_end_without_a_signal(tmp_path):
+    """Which could arrive while they end, and be reported as an error."""
+    with WorkerPool(2) as pool:
+        assert len(list(pool.run(whose, [str(tmp_path)], range(4)))) == 4
+        processes = [worker.process for worker in pool.workers]
+    assert [process.exitcode for process in processes] == [0, 0]
+
+
 def test_a_worker_that_dies_before_it_is_asked_is_replaced(tmp_path):
     with WorkerPool(1) as pool:
         pool.begin(whose)

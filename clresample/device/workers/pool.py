@@ -36,6 +36,8 @@ class _WorkerProcess(Worker):
         if self.process is None:
             return
         self.pipe.close()
+        if self.task is None:  # an idle one ends by itself: a signal on its way would be reported
+            self.process.join(2)
         self.process.terminate()
         self.process.join(2)
         if self.process.is_alive():
