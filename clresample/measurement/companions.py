@@ -63,12 +63,12 @@ def symmetric_residual(image, seen, positions):
     radii = np.arange(REACH_PX + 1.0)[:, None]
     total = np.zeros(image.shape, np.float32)
     for y, x in positions:
-        if not seen[round(y), round(x)]:  # its centre was not observed
-            continue
-        rings = map_coordinates(
-            light, [y + radii * np.sin(angles), x + radii * np.cos(angles)], order=1, cval=UNSEEN
-        )
-        rings = np.minimum(rings, np.roll(rings, N_ANGLES // 2, axis=1))
+        at = y + radii * np.sin(angles), x + radii * np.cos(angles)
+        if seen[round(y), round(x)]:
+            rings = map_coordinates(light, at, order=1, cval=UNSEEN)
+            rings = np.minimum(rings, np.roll(rings, N_ANGLES // 2, axis=1))
+        else:  # its centre is not known well enough: all light that falls outwards counts
+            rings = map_coordinates(image, at, order=1)
         rings = np.clip(np.minimum.accumulate(rings, axis=0), 0, brightest)
         bright = np.flatnonzero((rings > MIN_LIGHT).any(axis=1))
         if not len(bright):

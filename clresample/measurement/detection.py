@@ -316,7 +316,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     They are found in the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]:
     of a pixel.
     """
-    image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
+    image, seen = signals[sharp].flat(), signals[sharp].measured
     centres = np.array(
         [
             parabolic_peak(image if image[tuple(p.astype(int))] > threshold else everything, p)

@@ -16,11 +16,10 @@ The remainder of the image is searched, in units of its scatter on the same ring
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import (
-    distance_transform_edt,
     grey_dilation,
     grey_erosion,
     map_coordinates,
@@ -54,8 +53,6 @@ MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge have no peaks of their own.
 MIN_CORE_DISTANCE_FWHM = 1.0
-# [FWHM of a filtered point] Pixels nearer to masked ones beside a star have none either.
-MIN_MASK_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
 SAME_STAR_FWHM = 1.0
 # Median |x| of a unit Gaussian, inverted.
@@ -124,7 +121,7 @@ def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoi
     all_held = np.zeros(signal.n_seen.shape, bool)
     if not stars:
         return signal, all_held
-    sums, squares, seen = signal.sums.copy(), signal.squares.copy(), signal.n_seen > 0
+    sums, squares, seen = signal.sums.copy(), signal.squares.copy(), signal.measured
     root = np.sqrt(np.maximum(signal.n_seen, 1))
     for w, sigma in enumerate(WIDTHS_ARCSEC):
         # of the PSF filtered with itself and twice with the Gaussian
@@ -134,7 +131,7 @@ def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoi
         sums[w] = np.where(held, rest * root, sums[w])
         squares[w][held] = 0
         all_held |= held
-    return SignalToNoise(sums, squares, signal.n_seen, signal.channels, signal.places), all_held
+    return replace(signal, sums=sums, squares=squares), all_held
 
 
 def _without_stars(image, seen, stars, fwhm):
@@ -142,7 +139,8 @@ def _without_stars(image, seen, stars, fwhm):
 
     Also returns the pixels (Ny, Nx) bool from which light was removed.
 
-    seen (Ny, Nx): bool; fwhm [px]: of a point source in the image
+    seen (Ny, Nx): bool, pixels whose light is measured; others near a star have none afterwards
+    fwhm [px]: of a point source in the image
     """
     rest, held = image, np.zeros(image.shape, bool)
     for star in stars:
@@ -171,7 +169,8 @@ def _in_window(image, seen, star, fwhm):
     away = np.hypot(dy, dx)
     rings = np.rint(away).astype(int)
     end = _end(image, seen, rings, int(star.radius))
-    own = (away < end) & seen
+    reached = away < end
+    own = reached & seen
     if not own.any():
         return image, own
     n_angles = int(np.ceil(2 * np.pi * end))
@@ -199,17 +198,8 @@ def _in_window(image, seen, star, fwhm):
     left = (left - middle[np.minimum(rings, end)]) / noise
     dips /= noise
     left[(dips > MIN_DIP_SIGMAS) & (left < MIN_OVER_DIP * dips)] = 0  # alternating pixels
-    # light beside pixels without weight comes from one side only
-    left[
-        (away < star.radius + MIN_CORE_DISTANCE_FWHM * fwhm)
-        | _beside(~seen, MIN_MASK_DISTANCE_FWHM * fwhm)
-    ] = 0
-    return np.where(own, left, image).astype(image.dtype), own
-
-
-def _beside(pixels, radius):
-    """Pixels (Ny, Nx) bool within a radius [px] of the given ones, included themselves."""
-    return distance_transform_edt(~pixels) < radius if pixels.any() else pixels
+    left[away < star.radius + MIN_CORE_DISTANCE_FWHM * fwhm] = 0
+    return np.where(reached, left, image).astype(image.dtype), reached
 
 
 def _opened(rays, length):

@@ -84,7 +84,7 @@ def test_all_workers_begin_before_they_are_asked(tmp_path):
 
 
 def test_idle_workers_end_without_a_signal(tmp_path):
-    """Which could arrive while they end, and be reported as an error."""
+    """It could arrive while they end, and be reported as an error."""
     with WorkerPool(2) as pool:
         assert len(list(pool.run(whose, [str(tmp_path)], range(4)))) == 4
         processes = [worker.process for worker in pool.workers]

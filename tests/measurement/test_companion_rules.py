@@ -234,7 +234,9 @@ def test_a_neighbour_on_a_flank_is_found_in_one_channel():
     image = spot((40, 38), 300, 4) + spot((40, 48), 60, 1.7)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = SignalToNoise(both, both**2, np.ones(image.shape, int), image[None], places)
+    signal = SignalToNoise(
+        both, both**2, np.ones(image.shape, int), image[None], places, np.ones(image.shape, bool)
+    )
     given = sep, [signal], 0, image, np.array([[40.0, 38.0]])
     ((place, height),) = detection._companions(*given, 5.0, 4.0, 0.1)
     assert np.hypot(*(place - (40, 48))) < 0.7 and height == pytest.approx(60, rel=0.15)
@@ -254,7 +256,7 @@ def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
     n_seen = np.array([[0, 1, 2]] * 3)
     image = np.zeros((3, 3), np.float32)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = SignalToNoise(both, both, n_seen, image[None], np.zeros((3, 3, 2)))
+    signal = SignalToNoise(both, both, n_seen, image[None], np.zeros((3, 3, 2)), n_seen > 0)
     detection._companions(None, [signal], 0, image, np.array([[1.0, 1.0]]), 5.0, 4.0, 0.1)
     assert given[0].tolist() == [[False, True, True]] * 3
 
@@ -270,7 +272,9 @@ def test_companions_have_five_sigma_however_low_the_threshold(monkeypatch):
     image = np.zeros((20, 20), np.float32)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = SignalToNoise(both, both, np.ones(image.shape, int), image[None], places)
+    signal = SignalToNoise(
+        both, both, np.ones(image.shape, int), image[None], places, image < np.inf
+    )
     for threshold in (2.0, 8.0):
         where = np.array([[10.0, 10.0]])
         detection._companions(None, [signal], 0, image, where, threshold, 4.0, 0.1)

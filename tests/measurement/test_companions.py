@@ -65,7 +65,9 @@ def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
     rest, model = rest_of(image, centre)
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
     signals = [
-        SignalToNoise(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)
+        SignalToNoise(
+            channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places, SEEN
+        )
     ]
     height = rest[tuple(place)]
     centres = np.array([centre])
@@ -115,7 +117,7 @@ def beside(narrow, wide, monkeypatch):
     """Places of neighbours of the source at (60, 60), where two peaks are seen about (60, 72)."""
     sums = np.stack([narrow, wide])
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
-    signals = [SignalToNoise(sums, sums**2, SEEN.astype(int), narrow[None], places)]
+    signals = [SignalToNoise(sums, sums**2, SEEN.astype(int), narrow[None], places, SEEN)]
     peaks = [(np.array([60.0, x]), 9.0) for x in (71, 73)]
     monkeypatch.setattr(detection, "new_peaks", lambda *args, **more: peaks)
     at = np.array([[60.0, 60.0]])

@@ -11,6 +11,7 @@ from clresample.deblending.posterior.residuals import convolved
 from clresample.deblending.profiles import draw_psf
 from clresample.deblending.settings import Settings
 from clresample.measurement.detection import detect, detect_more
+from clresample.measurement.signal_to_noise import signal_of
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -106,6 +107,27 @@ def test_the_combination_reaches_fainter_than_each():
     both = detect(observations, frame)
     assert not any(alone) and both.found_in == ("all",)
     assert nearest(both, 40, 45) < 3
+
+
+@pytest.mark.parametrize("first", [30, 38, 42, 48, 54])
+def test_masked_columns_beside_a_bright_source_are_no_sources(first):
+    """Nor where its centre is masked; there its place is that of the light about it."""
+    (sharp, blurred), frame = instruments([(40, 45, 2e4, 2e4)], size=3)
+    weights = np.ones(sharp.data.shape)
+    weights[..., first : first + 4] = 0
+    holed = Observation(sharp.data, sharp.psf, sharp.grid, weights=weights, name="sharp")
+    for observations in ([holed], [holed, blurred]):
+        found = detect(observations, frame)
+        assert len(found.sources) == 1 and nearest(found, 40, 45) < 5
+
+
+def test_noise_beside_masked_columns_has_unit_scatter():
+    (sharp, _), frame = instruments([])
+    weights = np.ones(sharp.data.shape)
+    weights[..., 3::9] = weights[..., 4::9] = weights[..., 5::9] = 0
+    holed = Observation(sharp.data, sharp.psf, sharp.grid, weights=weights, name="sharp")
+    signal = signal_of(holed, frame)
+    assert abs(signal.flat()[signal.n_seen > 0].std() - 1) < 0.1
 
 
 def test_unseen_sky_and_bad_pixels_are_no_sources():

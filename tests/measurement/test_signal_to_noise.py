@@ -89,7 +89,7 @@ def signal(each, seen):
     sums, squares = (np.zeros((len(WIDTHS_ARCSEC), *n_seen.shape), np.float32) for _ in range(2))
     sums[0], squares[0] = each.sum(axis=0), (np.maximum(each, 0) ** 2).sum(axis=0)
     places = np.moveaxis(np.indices(n_seen.shape), 0, -1).astype(float)
-    return SignalToNoise(sums, squares, n_seen, each, places)
+    return SignalToNoise(sums, squares, n_seen, each, places, n_seen > 0)
 
 
 def test_light_in_one_band_of_seven_is_more_significant_than_its_share_of_the_sum():

@@ -113,7 +113,7 @@ def test_scatter_is_that_of_the_negative_pixels_and_at_least_one():
     noise[:20] += 500  # sources are positive
     sums = np.stack([0.3 * noise, 3 * noise, np.full_like(noise, 4)])
     places = np.moveaxis(np.indices(noise.shape), 0, -1)
-    one = SignalToNoise(sums, sums**2, np.full(noise.shape, 4), sums[:1], places)
+    one = SignalToNoise(sums, sums**2, np.full(noise.shape, 4), sums[:1], places, noise < np.inf)
     np.testing.assert_allclose(one.scatters(), [1, 1.5, 1], rtol=0.05)
     over = one.divided_by(one.scatters())
     np.testing.assert_allclose(over.flat(1), one.flat(1) / one.scatters()[1], rtol=1e-6)
@@ -126,7 +126,9 @@ def test_observations_together_count_all_their_channels():
 
     def signal(n, *sums):
         found = np.broadcast_to(np.array(sums, np.float32)[:, None, None], (len(sums), *shape))
-        return SignalToNoise(found, 0 * found, np.full(shape, n), found[:1], places)
+        return SignalToNoise(
+            found, 0 * found, np.full(shape, n), found[:1], places, found[0] < np.inf
+        )
 
     assert len(WIDTHS_ARCSEC) == 3
     first, best = combine_bands([signal(1, 3, 4, 8), signal(3, 5, 2, 6)])
