@@ -23,6 +23,9 @@ that of all other sources, an error in M changes the light of u by
     E = NEIGHBOUR_MODEL_ERROR max(0, <u, M> - OWN_LIGHT alike <u, u>) / |u|
 
 in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
+The channels in which its neighbours have the least of its light may say more without the others:
+the least of (1 + E^2) |u|^2 / |u'|^2 counts, u' and E of the best of 1, 2, ... channels. A deep
+image of low resolution then does not hide what a sharp one shows of a galaxy.
 Light of stars in M counts by STAR_MODEL_ERROR. Of two galaxies that are alike each has its own
 light in the data, and neither shape is doubted: alike is |u| / |M|, at most 1, in the mean of M's
 sources by their light in u.
@@ -160,22 +163,29 @@ class PopulationPrior:
 
 
 def contamination_factors(normal, spectra, source, stars, own_light=OWN_LIGHT):
-    """1 + E^2 (k, n) of the components of some scenes; see the module's text.
+    """1 + E^2 over the part of the light that counts (k, n), of the components of some scenes.
+
+    See the module's text.
 
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
     source (k, n): to which each belongs; stars (k, n): bool, which of them are stars
     own_light: OWN_LIGHT, or that of each scene (k, 1)
     """
-    light = np.einsum("kci,kcij,kcj->kij", spectra, normal, spectra)
-    own = np.einsum("kii->ki", light)
+    light = np.einsum("kci,kcij,kcj->kcij", spectra, normal, spectra)
+    own = np.einsum("kcii->kci", light)
     # products of separate sources may be negative by rounding
-    light = np.maximum(light, 0) * (source[:, :, None] != source[:, None])
-    beside, size = light.sum(axis=2), np.sqrt(own)
+    light = np.maximum(light, 0) * (source[:, :, None] != source[:, None])[:, None]
+    size, beside = np.sqrt(own.sum(axis=1)), light.sum(axis=1)
     alike = size[:, :, None] / np.maximum(np.maximum(size[:, :, None], size[:, None]), 1e-30)
-    alike = (light * alike).sum(axis=2) / np.where(beside > 0, beside, 1)
-    wrong = (light * np.where(stars, STAR_MODEL_ERROR, NEIGHBOUR_MODEL_ERROR)[:, None]).sum(axis=2)
-    beyond = np.maximum(wrong - NEIGHBOUR_MODEL_ERROR * own_light * alike * own, 0)
-    return 1 + np.divide(beyond**2, own, out=np.zeros_like(own), where=own > 0)
+    alike = (beside * alike).sum(axis=2) / np.maximum(beside.sum(axis=2), 1e-30)
+    errors = np.where(stars, STAR_MODEL_ERROR, NEIGHBOUR_MODEL_ERROR)
+    wrong = np.einsum("kcij,kj->kci", light, errors)
+    order = np.argsort(wrong / np.maximum(own, 1e-30), axis=1)  # the least wrong channels first
+    own, wrong = (np.take_along_axis(x, order, axis=1).cumsum(axis=1) for x in (own, wrong))
+    beyond = np.maximum(wrong - (NEIGHBOUR_MODEL_ERROR * own_light * alike)[:, None] * own, 0)
+    known = np.maximum(own, 1e-30)
+    factors = np.where(own > 0, own[:, -1:] / known * (1 + beyond**2 / known), np.inf).min(axis=1)
+    return np.where(np.isfinite(factors), factors, 1)
 
 
 def em_step(off, variance, known, common, own):
