@@ -210,6 +210,18 @@ def test_flat_tops_are_masked_as_saturated():
     assert (weights[1, 19:22, 17:21] == 0).all() and (weights[0] > 0).all()
 
 
+@pytest.mark.parametrize("scatter, is_found", [(0.3, True), (3.0, False)])
+def test_flat_tops_are_flat_within_the_noise(scatter, is_found):
+    """Flat-fielded ones are; a top that scatters more than the noise may be a galaxy's."""
+    data = image_of(((DRAWN[0][0], (9e4, 9e4), 0.0), *DRAWN[1:]))
+    full = data[1] > 0.4 * data[1].max()
+    rest = scatter * NOISE * np.random.default_rng(1).normal(size=full.sum())
+    data[1, full] = 0.4 * data[1].max() + rest
+    found = spoilt.saturated(looked_at(observed(data)))
+    assert found[1][full].all() == is_found and found[1].any() == is_found
+    assert not found[0].any()
+
+
 def test_whole_numbers_are_not_flat_by_chance():
     assert not spoilt.saturated(looked_at(observed(np.rint(image_of())))).any()
 

@@ -5,6 +5,7 @@ import pytest
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
+from clresample.deblending.inspection.centroids import common
 from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
 from clresample.deblending.shifts import extrapolate, shift_steps
@@ -18,6 +19,22 @@ from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource
 
 SHARP, BLURRED = Grid.flat((60, 66), 0.1), Grid.flat((34, 36), 0.2, angle_deg=15)
+
+
+def test_one_source_that_moves_is_no_shift_of_its_image():
+    """A star of proper motion, known better than six galaxies that stay where they are."""
+    rng = np.random.default_rng(3)
+    errors = np.array([0.03, *np.full(6, 0.05)])
+    offsets = errors[:, None] * rng.normal(size=(7, 2))
+    still, error = common(offsets, errors)
+    assert (np.abs(still) < 4 * error).all() and (error < 0.05).all()
+    offsets[0] += 0.8, -0.6
+    moved, error = common(offsets, errors)
+    assert (np.abs(moved) < 4 * error).all() and (error < 0.05).all()
+    moved, error = common(offsets[:2], errors[:2])  # of two nobody knows which one
+    assert (error > 0.2).all()
+    shift, _ = common(offsets[1:] + 0.7, errors[1:])
+    assert np.allclose(shift, 0.7, atol=0.1)
 
 
 def blend(shift, *, seed=0, noise=1.0):

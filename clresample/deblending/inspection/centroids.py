@@ -17,6 +17,9 @@ REACH = 2.5
 MIN_RESPONSE = 0.1
 # [px] Smallest error of centroids, because of neighbours, structure and errors of the PSF.
 FLOOR_PX = 0.03
+# Deviation of one source from the others that is its own: a bright star of proper motion is known
+# better than all galaxies together.
+OUTLIER_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +89,28 @@ def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
 def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,).
 
-    The error follows from their scatter if that is larger; it is infinite without any.
+    The error follows from their scatter if that is larger; it is infinite without any. Of three
+    and more those further than OUTLIER_SIGMAS from the mean of the others are left out, the
+    furthest first.
     """
+    kept = np.isfinite(errors)
+    while kept.sum() > 2:
+        away = np.zeros(len(errors))
+        for i in np.flatnonzero(kept):
+            others = kept & (np.arange(len(errors)) != i)
+            mean, error = _mean_of(offsets[others], errors[others])
+            away[i] = (np.abs(offsets[i] - mean) / np.hypot(error, errors[i])).max()
+        if away.max() <= OUTLIER_SIGMAS:
+            break
+        kept[away.argmax()] = False
+    return _mean_of(offsets[kept], errors[kept])
+
+
+def _mean_of(offsets, errors):
     weight = errors**-2.0
     total = weight.sum()
     if not total > 0:
         return np.zeros(2), np.full(2, np.inf)
     mean = weight @ offsets / total
-    n = np.count_nonzero(weight)
     rest = (weight[:, None] * (offsets - mean) ** 2).sum(axis=0)
-    return mean, np.sqrt(np.maximum(1.0, rest / max(n - 1, 1)) / total)
+    return mean, np.sqrt(np.maximum(1.0, rest / max(len(weight) - 1, 1)) / total)
