@@ -18,8 +18,9 @@ MIN_RESPONSE = 0.1
 # [px] Smallest error of centroids, because of neighbours, structure and errors of the PSF.
 FLOOR_PX = 0.03
 # Deviation of one source from the others that is its own: a bright star of proper motion is known
-# better than all galaxies together.
-OUTLIER_SIGMAS = 5.0
+# better than all galaxies together. The others are three at least: two agree by chance, as in one
+# of 200 clean scenes.
+OUTLIER_SIGMAS, MIN_AGREEING = 5.0, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +90,12 @@ def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
 def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,).
 
-    The error follows from their scatter if that is larger; it is infinite without any. Of three
-    and more those further than OUTLIER_SIGMAS from the mean of the others are left out, the
-    furthest first.
+    The error follows from their scatter if that is larger; it is infinite without any. Those
+    further than OUTLIER_SIGMAS from the mean of the others are left out, the furthest first, as
+    long as MIN_AGREEING remain.
     """
     kept = np.isfinite(errors)
-    while kept.sum() > 2:
+    while kept.sum() > MIN_AGREEING:
         away = np.zeros(len(errors))
         for i in np.flatnonzero(kept):
             others = kept & (np.arange(len(errors)) != i)
