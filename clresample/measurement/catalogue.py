@@ -13,6 +13,7 @@ from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
 from ..deblending.assessment.status import misfitted_sources
 from ..deblending.assessment.unsettled import unsettled_sources
+from ..deblending.inspection.listing import doubles
 from ..deblending.posterior.residuals import channel_residuals
 from ..deblending.result import Result
 from ..sky.footprint import coverage_border
@@ -184,6 +185,9 @@ def _add_partners(table, result, flux, covariance):
     found = np.full(len(flux), -1)
     if result.errors is not None:
         found = partners(flux, covariance)
+        for pair in doubles(result.sources, result.frame.positions_of(result.sources)):
+            for one, other in (pair, pair[::-1]):
+                found[one] = other if found[one] < 0 else found[one]
     table.put("ambiguous_with", found)
     table["flags"][found >= 0] |= Flag.AMBIGUOUS
 

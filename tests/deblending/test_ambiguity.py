@@ -43,6 +43,14 @@ def test_the_channel_that_tells_best_decides():
     assert not is_ambiguous(flux[1:], covariance[1:]).any()
 
 
+def test_light_that_the_other_one_has_in_every_bright_channel():
+    """A channel in which both are faint is no reason that the others do not count."""
+    near, faint = pair(0.2, 8), pair(0.2, 1)
+    flux, covariance = (np.concatenate(both) for both in zip(near, faint, strict=True))
+    flux[0] = -3, 19  # the second one has the light of both
+    assert is_ambiguous(flux, covariance)[0]
+
+
 def test_a_bright_neighbours_own_error_is_no_exchange():
     flux, covariance = pair(0.2, 8, ratio=100.0)
     assert is_ambiguous(flux, covariance).tolist() == [True, False]

@@ -18,10 +18,10 @@ DETECTED = 5.0
 def is_ambiguous(flux, covariance) -> np.ndarray:
     """Returns for two sources (2,) True if its light may be the other one's.
 
-    Criteria, in the channel that determines a source best: its relative flux error is more than
-    UNDETERMINED; the error is dominated by the division of light, since it cancels in the sum of
-    both fluxes; and the sum is detected. Noise alone, or the errors of a bright neighbour, do not
-    suffice.
+    Criteria: its relative flux error is more than UNDETERMINED in the channel that determines it
+    best; and in some channel the error is dominated by the division of light, since it cancels in
+    the sum of both fluxes, and the sum is detected. Noise alone, or the errors of a bright
+    neighbour, do not suffice.
 
     flux (C, 2) [counts]; covariance (C, 2, 2) [counts^2]: of the two fluxes in each channel, those
         of channels without coverage infinite
@@ -36,13 +36,10 @@ def is_ambiguous(flux, covariance) -> np.ndarray:
         if not usable.any():
             continue
         snr = np.where(usable, flux[:, one] / np.sqrt(np.where(usable, own, 1.0)), -np.inf)
-        c = int(np.argmax(snr))
-        together = max(covariance[c].sum(), 0.0)
-        found[one] = (
-            UNDETERMINED * snr[c] < 1
-            and -shared[c] > EXCHANGED * own[c]
-            and flux[c].sum() > DETECTED * np.sqrt(together)
-        )
+        together = np.maximum(covariance.sum(axis=(1, 2), where=usable[:, None, None]), 0.0)
+        exchanged = usable & (-shared > EXCHANGED * own)
+        detected = flux.sum(axis=1, where=usable[:, None]) > DETECTED * np.sqrt(together)
+        found[one] = UNDETERMINED * snr.max() < 1 and (exchanged & detected).any()
     return found
 
 
