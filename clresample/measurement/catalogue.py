@@ -180,6 +180,7 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
 def _add_partners(table, result, flux, covariance):
     """Adds the column of ambiguous sources' partners and their flag.
 
+    Sources at one place, which a message names, are each other's where they have no other one.
     Only results with Errors have them, because at fixed morphologies fluxes are not ambiguous.
     """
     found = np.full(len(flux), -1)

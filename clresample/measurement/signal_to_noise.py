@@ -25,6 +25,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..deblending.inspection.image import SIGMAS_A_FWHM
 from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
 from .levels import deficit_of, level_of
@@ -42,7 +43,6 @@ MIN_SEEN = 0.1
 # since n is lost in the rounding of float32. Of stars and galaxies whose photon noise was 5 to 4e4
 # times the sky's variance all were found whole; bad pixels of 1e6 times are holes.
 NO_WEIGHT = 1e-5
-FWHM_A_SIGMA = 2.3548  # of a Gaussian
 SAME_PX = 1e-3  # [px] distance below which model and observed pixels coincide
 # [1] of the narrowest filter's power, with that on filled pixels: smallest part on pixels with
 # weight of their own where light counts as measured.
@@ -145,7 +145,7 @@ def signal_of(observation, frame, places=None, *, deficits=True) -> SignalToNois
     inside = (..., *(slice(edge, edge + n) for n in shape))
     totals = np.zeros((2, len(sigmas), *shape), np.float32)
     channels = np.zeros(observation.data.shape, np.float32)
-    seen, guessed = np.zeros(shape, np.int16), np.zeros(shape, bool)
+    seen, measured = np.zeros(shape, np.int16), np.ones(shape, bool)
     step = max(1, TOGETHER_PX // math.prod(size))
     for first in range(0, n_channels, step):
         c = slice(first, first + step)
@@ -177,16 +177,16 @@ def signal_of(observation, frame, places=None, *, deficits=True) -> SignalToNois
                 totals[1, w] += np.maximum(image, 0) ** 2
             if w == 0:
                 channels[c] = images
-                own, lit = (
+                lit, own = (
                     fft.irfft2(fft.rfft2(mask.astype(np.float32), size) * power.conj(), size)[
                         inside
                     ]
-                    for mask in (known, weights > NO_WEIGHT * unit)
+                    for mask in (weights > NO_WEIGHT * unit, known)
                 )
                 some &= lit > MIN_SEEN * power[:, :1, :1].real
                 seen += some.sum(axis=0, dtype=np.int16)
-                guessed |= (some & (own < MIN_OWN * lit)).any(axis=0)
-    found, n_seen, measured = _in_frame(totals.reshape(-1, *shape), seen, ~guessed, places)
+                measured &= (~some | (own >= MIN_OWN * lit)).all(axis=0)
+    found, n_seen, measured = _in_frame(totals.reshape(-1, *shape), seen, measured, places)
     found = found.reshape(2, len(sigmas), *frame.shape)
     return SignalToNoise(found[0], np.maximum(found[1], 0), n_seen, channels, places, measured)
 
@@ -202,7 +202,7 @@ def _without_holes(data, weights, known, fwhm_px):
 
     data, weights = data.copy(), np.where(known, weights, 0)
     for c, fwhm in enumerate(fwhm_px):
-        sigma = fwhm / FWHM_A_SIGMA
+        sigma = fwhm / SIGMAS_A_FWHM
         about = gaussian_filter(known[c].astype(np.float32), sigma, mode="constant")
         hole = ~known[c] & (about > MIN_ABOUT)
         light, weight, squares = (

@@ -27,7 +27,7 @@ from scipy.ndimage import (
     median_filter,
 )
 
-from ..deblending.inspection.image import brightness, typical_sigma
+from ..deblending.inspection.image import SIGMAS_A_FWHM, brightness, typical_sigma
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
 from ..deblending.inspection.star_profile import RadialProfile
@@ -50,7 +50,6 @@ UNEVEN = 0.1
 MIN_DIP_SIGMAS, MIN_OVER_DIP = 2.0, 3.0
 MAX_REACH_PX = 300  # [model px] largest radius from which light is removed; it is faint beyond
 MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
-FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge have no peaks of their own.
 MIN_CORE_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
@@ -125,7 +124,7 @@ def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoi
     root = np.sqrt(np.maximum(signal.n_seen, 1))
     for w, sigma in enumerate(WIDTHS_ARCSEC):
         # of the PSF filtered with itself and twice with the Gaussian
-        wide = FWHM_A_SIGMA * sigma / pixel_arcsec
+        wide = SIGMAS_A_FWHM * sigma / pixel_arcsec
         point_px = np.sqrt(2) * np.hypot(fwhm_px, wide)
         rest, held = _without_stars(signal.flat(w), seen, stars, point_px)
         sums[w] = np.where(held, rest * root, sums[w])
