@@ -98,7 +98,7 @@ def batch_row(batch, clock, settings):
     clock.ticks(N_TICKS)
     start = time.perf_counter()
     blends = [scenes.blend(scene, "joint") for scene in batch]
-    results = deblend_many(blends, settings=settings)
+    results = deblend_many(blends, settings=settings, processes=1)
     seconds = time.perf_counter() - start
     clock.ticks(N_TICKS)
     for result in results:

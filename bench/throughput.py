@@ -67,7 +67,7 @@ def timed(what, blends, clock, processes=1):
     clock.ticks(N_TICKS)
     wall_s, core_s = time.perf_counter(), _core_s()
     with host_stages() as host:
-        results = scenes.fit(blends, device=[None] * processes if processes > 1 else None)
+        results = scenes.fit(blends, processes=processes)
         for result in results:
             if result.status == "failed":
                 raise RuntimeError(result.reason)

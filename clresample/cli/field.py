@@ -58,8 +58,8 @@ def add_field(commands):
         "--workers",
         metavar="N",
         type=non_negative_integer,
-        default=1,
-        help="processes that search and fit; 0 = this one (default %(default)s)",
+        help="processes that search and fit; 0 = this one (default: one for each core of a CPU "
+        "with 1.5 GB of free memory, one for each GPU)",
     )
     parser.add_argument(
         "--worker-memory",
@@ -133,7 +133,9 @@ def run(arguments):
             f"more"
         )
     devices = arguments.device.split(",") if arguments.device else []
-    workers = max(arguments.workers, len(devices)) if len(devices) > 1 else arguments.workers
+    workers = arguments.workers
+    if workers is None:
+        workers = len(devices) if len(devices) > 1 else _n_workers(arguments, *devices)
     options = replace(
         field.options,
         workers=workers,
@@ -160,6 +162,16 @@ def run(arguments):
     finally:
         progress.close()
     return _report(arguments, done, time.perf_counter() - started)
+
+
+def _n_workers(arguments, device=None):
+    """Number of workers for a device, where the command does not say it."""
+    from ..device.discovery import choose
+    from ..device.multi_device import PROCESS_MEMORY, n_beside
+
+    if arguments.scheduler is not None:
+        return 1
+    return n_beside(choose(device), max(PROCESS_MEMORY, arguments.worker_memory or 0))
 
 
 def _report(arguments, done, took):

@@ -2,8 +2,8 @@
 
 Each device has its own process, because several OpenCL drivers in one process disturb each other.
 
-Processes are started by "spawn": a script that calls this must put its own statements under
-`if __name__ == "__main__":`, as for Python's multiprocessing.
+Processes are started by "spawn". Unless `imports_main` is False, a script that calls this must put
+its own statements under `if __name__ == "__main__":`, as for Python's multiprocessing.
 """
 
 from __future__ import annotations
@@ -21,11 +21,18 @@ from threadpoolctl import threadpool_limits
 
 from .device import Device, get_device
 from .device_cache import DeviceWarning
-from .discovery import DeviceError, choose, find_devices, n_host_cores
+from .discovery import (
+    DeviceError,
+    choose,
+    find_devices,
+    is_simulated,
+    kind_of,
+    n_host_cores,
+)
 from .workers.crew import TaskQueue
 from .workers.outcome import Cause, Reason
 from .workers.pool import WorkerPool
-from .workers.process_limits import thread_environment
+from .workers.process_limits import free_memory, thread_environment
 
 # Items of a device's first portion, before its speed is known.
 FIRST_BATCH = 4
@@ -36,6 +43,8 @@ BATCH_FRACTION = 0.5
 INTERRUPT_TIMEOUT_S = 60.0
 # Largest number of host threads, each with its own intermediate arrays. More were not tried.
 MAX_THREADS = 4
+# [bytes] Free memory for a process of fits: libraries, a group and its results.
+PROCESS_MEMORY = 3 << 29
 
 
 class _BlasThreadLimit:
@@ -76,6 +85,18 @@ def host_threads(device):
     n_cores = n_host_cores()
     n_units = device.compute_units if device.kind == "CPU" else n_cores
     return min(n_cores, n_units, MAX_THREADS)
+
+
+def n_beside(cl_device, memory=PROCESS_MEMORY) -> int:
+    """Number of processes that a device does well to have side by side.
+
+    One for each core of a CPU, as far as free memory suffices for this much [bytes] each; 1 for
+    other devices, and at least.
+    """
+    if kind_of(cl_device) != "CPU" or is_simulated(cl_device):
+        return 1
+    n_cores = min(n_host_cores(), cl_device.max_compute_units)
+    return max(1, min(n_cores, free_memory() // memory))
 
 
 def map_threads(n_threads, function, items):
@@ -138,22 +159,24 @@ def prefetch(items):
         thread.join()
 
 
-def distribute(function, items, devices, *, done, most):
+def distribute(function, items, devices, *, done, most, equal=False, imports_main=True):
     """Distributes `items` to several devices; returns the results in the items' order.
 
     function(items, device=) -> [result, ...]: picklable, as are items and results
     devices: choices in the forms of `get_device`, at least one; one named twice gets two processes
     done: called with the number of items done, after each portion
     most: items of a portion at most
+    equal: portions of `most` items each, so that results do not depend on the devices' speed
+    imports_main: see `WorkerPool`
     returns a list of results; None for an item that was not computed because of Ctrl-C
-    Portions are sized by measured speed. If a device cannot be opened, or its process dies or
+    Other portions are sized by measured speed. If a device cannot be opened, or its process dies or
     raises, a DeviceWarning names it and its portion goes to the others.
     Raises ValueError without devices; DeviceError if nothing fits a choice, or all devices failed.
     """
     if not devices:
         raise ValueError("device is an empty list, must name at least one")
-    portions = _Portions(items, most)
-    with _DevicePool([_named(choice) for choice in devices]) as pool:
+    portions = (_EqualPortions if equal else _Portions)(items, most)
+    with _DevicePool([_named(choice) for choice in devices], imports_main) as pool:
         job = _compute, [(function, index) for _, index in pool.devices]
         try:
             for outcome in pool.outcomes(job, portions):
@@ -201,20 +224,29 @@ class _Portions(TaskQueue):
         self.speeds[outcome.worker] = len(outcome.task) / seconds
 
 
+class _EqualPortions(_Portions):
+    """Portions of `most` items each, in their order."""
+
+    def take(self, worker, workers):
+        """The next portion, for any worker."""
+        return [self.waiting.popleft() for _ in range(min(self.most, len(self)))]
+
+
 class _DevicePool(WorkerPool):
     """A process for each device, which is lost with its first failure.
 
     Processes of one CPU device share its threads: with all of them each, launches wait for threads
     that other processes' launches keep from running.
 
-    devices: name and index of each
+    devices: name and index of each; imports_main: see WorkerPool
     """
 
     FAULTS, MAX_FAULTS = (Cause.DEVICE, Cause.WORKER), 1
 
-    def __init__(self, devices):
+    def __init__(self, devices, imports_main=True):
         most = max(Counter(devices).values())  # processes that share a device
         given = {"environment": thread_environment(most), "setup": _interruptible}
+        given["imports_main"] = imports_main
         super().__init__(len(devices), **given, reason_of=_failed)
         self.devices, self.faults = devices, []
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..deblending.settings import FitSettings, Settings
+from ..device.workers.process_limits import free_memory
 from ..measurement.detection import THRESHOLD
 from .area import AREAS
 from .blends.cut import FitLimits
@@ -107,18 +107,10 @@ class FieldOptions:
             memory = min(MEMORY, (self.worker_memory - MIN_BOUND // 2) // 2)
         if memory is None:
             n_workers = max(self.workers, len(self.devices), 1)
-            free = int(_free_memory() * MEMORY_PART / n_workers)
+            free = int(free_memory() * MEMORY_PART / n_workers)
             return replace(self, group_memory=max(MIN_MEMORY, min(MEMORY, free)))
         max_bytes = min(self.limits.max_bytes, memory)
         return replace(self, group_memory=memory, limits=replace(self.limits, max_bytes=max_bytes))
-
-
-def _free_memory() -> int:
-    """Free memory [bytes] of this machine; 2 GiB if unknown."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return 2 << 30
 
 
 @dataclass(eq=False)

@@ -4,6 +4,7 @@ import os
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from helpers.portions import fails_on_seven, first_dies, slow, squares
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -12,6 +13,7 @@ from clresample import Blend, DeviceError, deblend, deblend_many
 from clresample.deblending import batch
 from clresample.device import multi_device
 from clresample.device.device_cache import DeviceWarning
+from clresample.device.discovery import n_host_cores
 from clresample.device.multi_device import (
     _DevicePool,
     _Portions,
@@ -74,7 +76,7 @@ def test_everything_is_done_once_and_in_order(device):
 
 
 def test_processes_of_one_device_share_its_threads():
-    share = str(max(1, (os.cpu_count() or 1) // 2))
+    share = str(max(1, n_host_cores() // 2))
     assert _DevicePool([("cpu", 0)] * 2).environment["POCL_MAX_PTHREAD_COUNT"] == share
     assert "POCL_MAX_PTHREAD_COUNT" not in _DevicePool([("cpu", 0), ("gpu", 1)]).environment
 
@@ -92,6 +94,29 @@ def test_what_a_dead_process_had_is_done_by_the_others(device, tmp_path):
     with pytest.warns(DeviceWarning, match="ended with exit status 3; .* goes on") as caught:
         results, _ = dealt(first_dies, items, [device, device])
     assert results == list(range(12)) and caught[0].filename == __file__
+
+
+def test_equal_portions_do_not_depend_on_speed(device):
+    done, most = [], 3
+    run = {"done": done.append, "most": most, "equal": True, "imports_main": False}
+    results = distribute(squares, range(8), [device, device], **run)
+    assert [square for square, _ in results] == [n * n for n in range(8)]
+    pids = [pid for _, pid in results]
+    assert all(len(set(pids[i : i + most])) == 1 for i in range(0, 8, most))
+    assert sorted(np.diff([0, *done])) == [2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    "kind, cores, units, free_gb, expected",
+    [("CPU", 8, 8, 64, 8), ("CPU", 8, 2, 64, 2), ("CPU", 2, 8, 64, 2), ("CPU", 8, 8, 5, 3)]
+    + [("CPU", 8, 8, 0.1, 1), ("GPU", 8, 80, 64, 1)],
+)
+def test_processes_beside_each_other(kind, cores, units, free_gb, expected, monkeypatch):
+    monkeypatch.setattr(multi_device, "kind_of", lambda device: kind)
+    monkeypatch.setattr(multi_device, "is_simulated", lambda device: False)
+    monkeypatch.setattr(multi_device, "n_host_cores", lambda: cores)
+    monkeypatch.setattr(multi_device, "free_memory", lambda: int(free_gb * 2**30))
+    assert multi_device.n_beside(SimpleNamespace(max_compute_units=units)) == expected
 
 
 def test_without_items_or_devices(device):

@@ -349,7 +349,7 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
 
 @pytest.mark.parametrize("free", [1 << 30, 5 << 30, 100 << 30])
 def test_blends_are_cut_alike_whatever_memory_is_free(free, monkeypatch):
-    monkeypatch.setattr(options, "_free_memory", lambda: free)
+    monkeypatch.setattr(options, "free_memory", lambda: free)
     for workers in (0, 2, 16):
         given = FieldOptions(workers=workers).with_memory()
         assert given.limits == FitLimits()

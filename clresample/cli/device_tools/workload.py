@@ -90,7 +90,7 @@ def fit(given, device, **settings):
     """Results of blends, fitted side by side, without warnings about undetected sources."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SourceWarning)
-        results = deblend_many(given, settings=Settings(**settings), device=device)
+        results = deblend_many(given, settings=Settings(**settings), device=device, processes=1)
     for result in results:
         if result.status == Ended.FAILED:
             raise DeviceError(f"{device.name}: a fit that should succeed failed: {result.reason}")

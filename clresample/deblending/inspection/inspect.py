@@ -55,7 +55,7 @@ def warn_of_many(problems):
         f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "
         f"{problems[0][0]}; see the messages of the results",
         InputWarning,
-        stacklevel=4,
+        stacklevel=3,
     )
 
 

@@ -7,6 +7,8 @@ import gc
 import multiprocessing
 import os
 import signal
+import sys
+import types
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from typing import Any
@@ -72,6 +74,8 @@ class WorkerPool(Crew):
         the processor's threads
     setup: called without arguments by each process first; None = nothing
     reason_of: makes the Reason of an exception of a task
+    imports_main: processes import the caller's script, as Python's own do, so that it must be
+        guarded by `if __name__ == "__main__":`; without it tasks cannot name what it defines
 
     `setup` and `reason_of` belong to modules, so that a process can import them. A context manager,
     which closes it.
@@ -86,10 +90,11 @@ class WorkerPool(Crew):
         environment=None,
         setup=None,
         reason_of=Reason.of,
+        imports_main=True,
     ):
         self.n_workers, self.limit_s = n_workers, limit_s
         self.environment = thread_environment(n_workers) if environment is None else environment
-        self._given = bound, setup, reason_of
+        self._given, self._imports_main = (bound, setup, reason_of), imports_main
         self.workers = [_WorkerProcess(number) for number in range(n_workers)]
 
     def __enter__(self):
@@ -196,13 +201,25 @@ class WorkerPool(Crew):
             process = processes.Process(
                 target=_work, args=(theirs, os.getpid(), *self._given), daemon=True
             )
-            process.start()
+            with contextlib.nullcontext() if self._imports_main else _without_main():
+                process.start()
         finally:
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
         theirs.close()
         worker.process, worker.pipe = process, ours
+
+
+@contextlib.contextmanager
+def _without_main():
+    """Context in which processes start as if the caller's script were empty."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _work(pipe, parent, bound, setup, reason_of):

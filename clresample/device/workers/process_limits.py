@@ -9,6 +9,8 @@ import os
 import signal
 import sys
 
+from ..discovery import n_host_cores
+
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
@@ -20,7 +22,7 @@ def thread_environment(n_workers) -> dict:
     """
     environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     if n_workers > 1:
-        n_threads = max(1, (os.cpu_count() or 1) // n_workers)
+        n_threads = max(1, n_host_cores() // n_workers)
         names = "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"
         environment |= dict.fromkeys(names, str(n_threads))
     return environment
@@ -39,6 +41,18 @@ def limit_memory(bound):
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     if most == resource.RLIM_INFINITY or bound < most:
         resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))
+
+
+def free_memory() -> int:
+    """Free memory [bytes] of this machine, with what its caches would give up; 2 GiB if unknown."""
+    with contextlib.suppress(OSError, StopIteration, ValueError, IndexError):  # Linux
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            line = next(line for line in lines if line.startswith("MemAvailable:"))
+        return int(line.split()[1]) * 1024
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return 2 << 30
 
 
 def trim_memory():

@@ -223,7 +223,8 @@ def _fits(job, blends, rough=None):
         with warnings.catch_warnings():
             for kind in (SourceWarning, InputWarning):  # the results' messages are stored
                 warnings.simplefilter("ignore", kind)
-            found = deblend_many(few, settings=settings, device=device, memory=job.memory)
+            run = {"device": device, "memory": job.memory, "processes": 1}
+            found = deblend_many(few, settings=settings, **run)
         if any(r.status == Ended.INTERRUPTED for r in found):
             raise KeyboardInterrupt
         for failure in (r for r in found if isinstance(r, Failure)):
