@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import bdtrc
 
 from ..deblending.assessment.status import misfitted_sources
 from ..deblending.posterior.residuals import pixels_in_boxes
@@ -17,6 +18,9 @@ PIXEL_RADIUS = 0.5**0.5
 BESIDE = 4.0
 # [sigma] Light of a pixel beside a saturated core is brighter: detectors saturate at 1e3 sigma.
 SATURATED_SIGMAS = 20.0
+# [1] Probability by which so many of the pixels within twice a core's radius are masked by chance,
+# if masked pixels are as frequent as in the rest of the image: rows, columns, cosmic rays.
+BY_CHANCE = 0.02
 
 
 def summary(result) -> dict:
@@ -93,7 +97,8 @@ def masked_cores(result, positions):
     The core consists of the pixels within half of the PSF's FWHM of the position (S, 2)
     [model px], and the pixel at the position. The criterion is one pixel without weight for a point
     source, in a channel with enough of its light to determine a flux. For others it is half of the
-    core, and a neighbouring pixel of over 20 sigma, since faint sources do not saturate.
+    core, more masked pixels in and beside it than by chance, see BY_CHANCE, and a neighbouring
+    pixel of over 20 sigma, since faint sources do not saturate.
     """
     found, lost = np.zeros(len(result.sources), dtype=bool), None
     for channels, footprint in zip(result.channel_slices(), result.footprints, strict=True):
@@ -101,8 +106,7 @@ def masked_cores(result, positions):
         masked = observation.weights == 0
         if not masked.any():
             continue
-        scale = np.sqrt(abs(np.linalg.det(footprint.mapping.matrix)))  # [model px / px]
-        radius = scale * np.maximum(observation.psf.fwhm_px / 2, PIXEL_RADIUS)
+        radius = footprint.pixel_scale * np.maximum(observation.psf.fwhm_px / 2, PIXEL_RADIUS)
         for i in np.flatnonzero(fitted_sources(result) & ~found):
             distance = np.linalg.norm(footprint.positions - positions[i], axis=-1)
             core = distance <= radius[:, None, None]
@@ -113,10 +117,19 @@ def masked_cores(result, positions):
                 found[i] = (masked & core)[~lost[i, channels]].any()
                 continue
             half = 2 * (masked & core).sum(axis=(1, 2)) >= core.sum(axis=(1, 2))
+            half &= _chance(masked, distance <= 2 * radius[:, None, None]) < BY_CHANCE
             beside = ~masked & (distance <= BESIDE * radius[:, None, None])
             light = np.where(beside, observation.data * np.sqrt(observation.weights), 0)
             found[i] = (half & (light.max(axis=(1, 2)) > SATURATED_SIGMAS)).any()
     return found
+
+
+def _chance(masked, near):
+    """Probability (C,) of as many masked pixels (C, My, Mx) among those near by chance."""
+    far, axes = ~near, (1, 2)
+    part = (masked & far).sum(axis=axes) / np.maximum(far.sum(axis=axes), 1)
+    n = np.maximum((masked & near).sum(axis=axes), 1)
+    return bdtrc(n - 1, near.sum(axis=axes), part)
 
 
 def chi2_terms(result, i_observation, used):

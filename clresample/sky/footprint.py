@@ -35,6 +35,11 @@ class Footprint:
         """Pixels (C, My, Mx) that a fit uses: on the frame, with a weight after whitening."""
         return (self.observation.whitened.weights > 0) & self.mapping.covered
 
+    @property
+    def pixel_scale(self) -> float:
+        """Side of a pixel of the observation [model px]."""
+        return float(np.sqrt(abs(np.linalg.det(self.mapping.matrix))))
+
     @cached_property
     def positions(self) -> np.ndarray:
         """Centres (My, Mx, 2) [model px] of all pixels: (y, x)."""
@@ -86,14 +91,21 @@ def unobserved(footprints, shape) -> np.ndarray:
     """Unobserved pixels of the frame, with a border: (Ny + 2, Nx + 2) bool.
 
     These are the border and all pixels without weight in any channel that are connected to it
-    through such pixels. Masked pixels inside an image, single or in groups, do not belong to them.
+    through such pixels. Masked pixels inside an image, single or in groups, do not belong to them,
+    nor do strips no wider than the FWHM of the sharpest PSF, such as bad rows and columns: light
+    on them is known from the pixels on both sides.
     """
     points = np.stack([*np.indices(shape)], axis=-1)
-    seen = np.zeros(shape, dtype=bool)
+    seen, widths = np.zeros(shape, dtype=bool), []
     for footprint in footprints:
         held, (n, m) = footprint.nearest_pixels(points)
         seen |= held & (footprint.observation.weights > 0).any(axis=0)[n, m]
+        widths.append(footprint.pixel_scale * footprint.observation.psf.fwhm_px.min())
     ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
     if seen.all():
         return ring
-    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=np.pad(~seen, 1, constant_values=True))
+    wider = int(min(widths)) + 1
+    outside = np.pad(~seen, wider, constant_values=True).astype(np.uint8)
+    inner = slice(wider - 1, 1 - wider or None)
+    wide = ndimage.grey_opening(outside, size=wider)[inner, inner] > 0
+    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=wide)

@@ -69,6 +69,10 @@ def test_edge_is_light_beside_sky_that_no_observation_saw():
     holes = np.ones((2, 60, 70))
     holes[:, 31:34, 36:39] = 0  # a masked patch is no edge
     assert seen(holes) == [Flag(0)]
+    for width, expected in ((3, Flag(0)), (4, Flag.EDGE)):  # the PSF's FWHM is 3 px
+        strip = np.ones((2, 60, 70))
+        strip[:, :, 38 : 38 + width] = 0  # from edge to edge
+        assert seen(strip) == [expected], width
 
 
 def test_masked_is_the_centres_own_pixel():
@@ -116,6 +120,21 @@ def test_saturated_is_a_bright_galaxy_with_half_of_its_core_masked(reach, light,
     source = (ExtendedSource(position_px=(30.0, 36.0)),)
     (found,) = flags(one_source(observations=[o], sources=source))
     assert bool(found & Flag.SATURATED) == expected
+
+
+def test_masks_all_over_an_image_do_not_show_that_a_galaxy_is_saturated():
+    grid, rng = Grid.flat((60, 70), SCALE), np.random.default_rng(0)
+    data = np.zeros((2, 60, 70))
+    data[1, 28:33, 34:39] = 50.0
+    source = (ExtendedSource(position_px=(30.0, 36.0)),)
+    for part, expected in ((0.0, Flag.SATURATED), (0.4, Flag(0))):
+        weights = np.broadcast_to(rng.uniform(size=(60, 70)) >= part, (2, 60, 70)).astype(float)
+        weights[:, 29:32, 35:38] = 1
+        weights[:, 30:32, 35:38] = 0  # six of the nine pixels of the core
+        o = observe(grid, ("g", "r"), weights=weights)
+        o = Observation(data, o.psf, grid, weights=weights, channels=o.channels, name=o.name)
+        (found,) = flags(one_source(observations=[o], sources=source))
+        assert found & Flag.SATURATED == expected
 
 
 def test_a_core_is_as_large_as_the_psf_of_larger_pixels():
