@@ -42,6 +42,7 @@ from .companions import (
     residual_scatter,
     symmetric_residual,
 )
+from .constant_sky import search_without_sky
 from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
@@ -102,7 +103,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     threshold [sigma]: smallest signal to noise of a peak. White noise reaches 5 once in two
         million independent pixels of one image; lower thresholds find more noise
     scatters (n_observations, n_widths): scatter of each observation's signal to noise without
-        sources, by which it is divided; None = from `noise_scatter`, for this patch of sky
+        sources, by which it is divided; None = from `noise_scatter`, for this patch of sky, whose
+        constant level is subtracted too, where pixels without a source certainly have one
     returns Detection; pass its sources to `deblend` with its frame
 
     Raises ValueError for a threshold that is not a positive number, and for observations that do
@@ -113,7 +115,13 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     check_observations(observations)
     frame = model_frame(observations) if frame is None else check_instance("frame", frame, Frame)
     observations = without_rays(prepared(observations)[0], frame)
-    return _search(observations, frame, threshold, [], scatters)
+
+    def search(images):
+        return _search(images, frame, threshold, [], scatters)
+
+    if scatters is not None:
+        return search(observations)
+    return search_without_sky(observations, frame, search)
 
 
 def noise_scatter(observation, frame) -> np.ndarray:

@@ -194,6 +194,14 @@ def with_weights(observation, weights) -> Observation:
     return made
 
 
+def with_data(observation, data) -> Observation:
+    """The same observation with these data (C, Ny, Nx) [counts]."""
+    made = copy.copy(observation)
+    made.__dict__.pop("whitened", None)  # cached for the other data
+    made._set(data=data)
+    return made
+
+
 def with_psf_field(observation, psf_field) -> Observation:
     """The same observation with the PSFs of a PSFField; its PSF in the middle stays."""
     made = copy.copy(observation)

@@ -26,7 +26,7 @@ from clresample.deblending.inspection.inspect import (
     HELD_PART,
     SMALL_PART,
     _level_lines,
-    _wrong_levels,
+    wrong_levels,
 )
 from clresample.sky.frame import model_frame
 from clresample.sky.observation import Observation
@@ -127,7 +127,7 @@ def test_a_level_under_wings_may_be_wrong():
     for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
         sky = sky_of(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
-        wrong, dark = _wrong_levels(looked_at(o), sky)
+        wrong, dark = wrong_levels(looked_at(o), sky)
         assert not (wrong | dark).any()
         found.append(_level_lines(looked_at(o), sky, wrong, sky, False))
     (line,), *others = found

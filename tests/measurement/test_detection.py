@@ -15,7 +15,7 @@ from clresample.measurement.signal_to_noise import signal_of
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
-from clresample.sky.observation import Observation
+from clresample.sky.observation import Observation, with_data
 from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource
 
@@ -220,3 +220,12 @@ def test_sources_in_the_shallow_part_of_a_mosaic_are_found():
     found = np.array([source.position_px for source in detect([seen]).sources])
     assert len(found) == len(places)
     assert all(np.hypot(*(found - place).T).min() < 1.5 for place in places)
+
+
+@pytest.mark.parametrize("level", [0.3, 1.0, -1.0, -10.0, 1000.0])
+def test_a_constant_sky_changes_no_sources(level):
+    """At 1 sigma a pixel hundreds of peaks of the sky are over 5 sigma under the widest filter."""
+    observations, frame = instruments([(30, 30, 300, 600), (50, 60, 100, 200)])
+    expected = [source.position_px for source in detect(observations, frame).sources]
+    over = [with_data(o, o.data + level) for o in observations]
+    assert [source.position_px for source in detect(over, frame).sources] == expected

@@ -97,7 +97,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
-        wrong, dark = _wrong_levels(image, sky)
+        wrong, dark = wrong_levels(image, sky)
         fitted = free or small or (auto and bool((wrong | dark).any()))
         image, wide, own = with_star_psfs(image, sources, fitted, free)
         n_channels += wide, own, image.inside * len(image.usable)
@@ -166,7 +166,7 @@ def _unmeasured(image):
     ]
 
 
-def _wrong_levels(image, sky):
+def wrong_levels(image, sky):
     """Selects channels (C,) whose sky is certainly not zero.
 
     By their SkyLevel, and of others by their rim: light is positive, so the sky of a rim below zero
@@ -198,7 +198,7 @@ def _common_level(image, sky):
 def _level_lines(image, sky, shown, expected, fitted):
     """Messages about a SkyLevel other than zero, and about light at the rim.
 
-    shown (C,): bool, channels by `_wrong_levels`; expected: SkyLevel of the fit; fitted: True if it
+    shown (C,): bool, channels by `wrong_levels`; expected: SkyLevel of the fit; fitted: True if it
         is fitted
     """
     lines = []
