@@ -114,7 +114,7 @@ def nearly_one(error):
     return matrix
 
 
-@pytest.mark.parametrize("error", [3e-7, 0.999e-6, 1e-6, 3.999e-6, 1e-5, 2e-4, 5e-3])
+@pytest.mark.parametrize("error", [3e-7, 0.999e-6, 1e-6, 3.999e-6, 1e-5, 2e-4])
 def test_rounding_that_leaves_a_matrix_indefinite_is_no_knowledge(error):
     """Nor is it by chance nearly infinite ignorance, where a ridge all but equals the error."""
     found = BlockCholesky(nearly_one(error)).inverse().dense()
