@@ -250,13 +250,13 @@ class Result(ResultDisplay):
     def sample_fluxes(self, n, rng=None) -> np.ndarray:
         """Draws the sources' fluxes (n, S, C) [counts] from the posterior, n times.
 
-        They are the fluxes of `sample`, corrected for light beyond the boxes and for the bound at 0
-        like those of `fluxes`, so that they scatter about the catalogue's; NaN if not measured.
-        They also scatter by what is open of the division of light between neighbours
-        (posterior/shared_light.py), of size and wings of faint galaxies (start/shape_grid.py), and
-        of the PSF's width (assessment/psf_width.py), which can make fluxes negative. Errors of the
-        catalogue are larger where they include light outside the images, a saturated core, or the
-        light of a star beside them.
+        They scatter about the catalogue's fluxes as its errors say, to first order like these,
+        without the bounds of `sample`: those of faint sources may be below 0. NaN if not measured.
+        So they include light beyond the boxes, Settings.flux_error_floor, and what is open of the
+        division of light between neighbours (posterior/shared_light.py), of size and wings of faint
+        galaxies (start/shape_grid.py), and of the PSF's width (assessment/psf_width.py). Errors of
+        the catalogue are larger where they include light outside the images, a saturated core, or
+        the light of a star beside them.
 
         rng: NumPy Generator, or a seed
 

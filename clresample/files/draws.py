@@ -22,9 +22,9 @@ def draw_hdus(draws):
     order, and number of neighbours that are eliminated later; how many of the modes are smooth, and
     their pixels, see ModeImages. DRAWLATER: these neighbours.
     DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated, smooth modes first; the factor
-    consists of each node's diagonal block and the block below it, in elimination order. DRAWUNIT,
-    DRAWWIDE, DRAWBANDS: see PosteriorSampler. DRAWPAIRS, DRAWLIGHT: source and change, and light,
-    of its FluxChanges.
+    consists of each node's diagonal block and the block below it, in elimination order. DRAWSUMS,
+    DRAWUNIT, DRAWWIDE, DRAWBANDS: see PosteriorSampler. DRAWPAIRS, DRAWLIGHT: source and change,
+    and light, of its FluxChanges.
     """
     if draws is None:
         return []
@@ -51,6 +51,7 @@ def draw_hdus(draws):
         fits.BinTableHDU(Table(rows, names=NODES), name="DRAWNODES"),
         image_hdu("DRAWLATER", np.array(later, np.int64)),
         image_hdu("DRAWMODES", _flat(arrays, np.float32)),
+        image_hdu("DRAWSUMS", _flat(draws.sums, np.float64)),
         image_hdu("DRAWSCALE", _flat(factor.scale, np.float64)),
         image_hdu("DRAWFACTOR", _flat(factor.blocks(), np.float64)),
         image_hdu("DRAWUNIT", draws.unit),
@@ -73,7 +74,8 @@ def read_draws(hdus, shapes):
     ends = np.cumsum(n_later)[:-1]
     later = [part.tolist() for part in np.split(array_of(hdus["DRAWLATER"]), ends)]
     modes = _ArrayReader(array_of(hdus["DRAWMODES"]))
-    scale, factor = (_ArrayReader(array_of(hdus[name])) for name in ("DRAWSCALE", "DRAWFACTOR"))
+    names = "DRAWSUMS", "DRAWSCALE", "DRAWFACTOR"
+    sums, scale, factor = (_ArrayReader(array_of(hdus[name])) for name in names)
     lower, below = {}, {}
     for v in order.tolist():
         lower[v] = factor.take(sizes[v], sizes[v])
@@ -82,6 +84,7 @@ def read_draws(hdus, shapes):
     bands, pairs, light = (array_of(hdus[f"DRAW{x}"]) for x in ("BANDS", "PAIRS", "LIGHT"))
     return PosteriorSampler(
         [_modes(modes, *given) for given in zip(shapes, counts, *smooth, strict=False)],
+        [sums.take(1 + count) for _, count in zip(shapes, counts, strict=False)],
         BlockCholesky.restore(
             sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below
         ),

@@ -262,7 +262,10 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     times as large at 15 sigma."""
     made, covariance = made_up(np.random.default_rng(0))
     n, unit, wide, floor = len(covariance), np.array([10.0, 3.0]), np.array([1, 3]), 0.02
-    errors = made.errors(OWNER, np.array([[1.0, np.nan], [15.0, 3.0]]), unit, floor)
+    run = OWNER, np.array([[1.0, np.nan], [15.0, 3.0]]), unit
+    floors = made.floors(*run, floor)
+    errors = made.errors(*run, floors)
+    draws = made.draws(*run)
     by = slopes(lambda v: fluxes(made, v).ravel(), n)  # (S C, n)
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
     released = np.concatenate(made.released[:3])
@@ -274,20 +277,22 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
         own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
         beyond[OWNER[i]] += FAR_ERROR * spectrum * far[0]
     for c in range(2):
-        wanted = (full[:, c, :, c] + np.diag(own[:, c] ** 2 + beyond[:, c] ** 2)) * np.outer(
-            wide, wide
-        )
+        wanted = full[:, c, :, c] * np.outer(wide, wide)
         np.testing.assert_allclose(errors.flux[c], wanted * unit[c] ** 2, rtol=1e-5)
+        both = np.stack([own[:, c], beyond[:, c]]) * wide * unit[c]
+        np.testing.assert_allclose(floors[:, :, c], both, rtol=1e-6)
     for s in range(2):
-        wanted = full[s, :, s] + np.outer(own[s], own[s]) + np.outer(beyond[s], beyond[s])
+        wanted = full[s, :, s]
         scale = np.outer(unit, unit) * wide[s] ** 2
         np.testing.assert_allclose(errors.colour[s], wanted * scale, rtol=1e-5)
-        weight = 1 / np.sqrt(np.diag(wanted))
+        weight = 1 / np.sqrt(np.diag(wanted) + own[s] ** 2 + beyond[s] ** 2)
         by = slopes(lambda v, s=s, w=weight: shapes(made, v, s, w), n)
         if s == 1:  # the other has no mode: nothing is known of its shape's error
             np.testing.assert_allclose(errors.moments[s], 9 * by @ covariance @ by.T, rtol=1e-4)
             np.testing.assert_allclose(errors.moment_bound_bias[s], by @ released, rtol=1e-4)
     assert np.isnan(errors.moments[0]).all() and not errors.moment_bound_bias[0].any()
+    for (morph, far, _), sums in zip(shifted(made, np.zeros(n)), draws.sums, strict=True):
+        assert sums[0] == pytest.approx(morph.sum() + far[0])
     ends = np.cumsum([0, *made.layout.sizes])
     assert len(errors.morphology) == 3 and not made.inverted
     for i, modes in enumerate(made.modes):

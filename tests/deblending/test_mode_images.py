@@ -14,7 +14,6 @@ from clresample.deblending.linear.mode_images import (
     sums_with,
 )
 from clresample.deblending.posterior import smooth_modes
-from clresample.deblending.posterior.errors import PosteriorSampler
 from clresample.deblending.posterior.posterior import Posterior
 from clresample.files.draws import draw_hdus, read_draws
 
@@ -75,8 +74,9 @@ def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
             one = Posterior(*given, fit_sky=True, fit_shifts=True)
         sharp = [not isinstance(m, ModeImages) for m in one.modes]
         assert sharp == [not wide, True]
-        found.append(one.errors(np.arange(2), np.zeros((2, 3)), np.ones(3), 0.0))
-        sampler = PosteriorSampler(one.modes, one.factor, np.ones(3), np.ones(2))
+        run = np.arange(2), np.zeros((2, 3)), np.ones(3)
+        found.append(one.errors(*run, np.zeros((0, 2, 3))))
+        sampler = one.draws(*run)
         draws.append(sampler.changes(0)[0].std(0))
     wide, fine = found
     for a, b in ((wide.colour, fine.colour), (wide.moments, fine.moments)):
@@ -91,9 +91,10 @@ def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
 def test_draws_on_wide_pixels_are_stored_bit_by_bit(given, monkeypatch):
     monkeypatch.setattr(smooth_modes, "MAX_MODES", 40)
     one = Posterior(*given)
-    sampler = PosteriorSampler(one.modes, one.factor, np.ones(3), np.ones(2))
+    sampler = one.draws(np.arange(2), np.zeros((2, 3)), np.ones(3))
     hdus = {hdu.name: hdu for hdu in draw_hdus(sampler)}
     back = read_draws(hdus, [m.shape[1:] for m in one.modes])
     for i in range(2):
+        np.testing.assert_array_equal(sampler.sums[i], back.sums[i])
         for a, b in zip(sampler.changes(i), back.changes(i), strict=True):
             np.testing.assert_array_equal(a, b)

@@ -253,15 +253,8 @@ def test_drawn_fluxes_scatter_about_the_catalogues(fitted):
     flux, error = fluxes(fitted)[0], errors(fitted)
     drawn = fitted.sample_fluxes(400, 1)
     assert drawn.shape == (400, *flux.shape)
-    np.testing.assert_allclose(drawn.mean(0), flux, atol=0.25 * error.max())
+    assert (np.abs(drawn.mean(0) - flux) < 0.2 * error).all()  # 4 of its errors
     assert (np.abs(drawn.std(0) / error - 1) < 0.12).all()
-    rng, by_hand = np.random.default_rng(1), np.zeros(flux.shape)
-    for i, c in enumerate(fitted.sample(1, rng)[0]):
-        by_hand[c.source] += c.spectrum * (
-            c.morphology.sum() + fitted.errors.outside_box_moments[i, 0]
-        )
-    by_hand += fitted.draws.flux_changes.draw(len(flux), rng)
-    np.testing.assert_allclose(drawn[0], by_hand + fitted.errors.flux_correction)
 
 
 def test_stored_and_read_back(fitted, tmp_path):
@@ -294,5 +287,5 @@ def test_results_of_an_older_format_are_refused(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(store, "FORMAT", 1)
     write_result(tmp_path / "blend.fits", fitted)
     monkeypatch.undo()
-    with pytest.raises(FileError, match="has format 1, this version reads 5: fit it again"):
+    with pytest.raises(FileError, match="has format 1, this version reads 6: fit it again"):
         read_result(tmp_path / "blend.fits")

@@ -313,10 +313,14 @@ def test_draws_are_numbers_times_modes_and_spectra_in_counts():
     values = [np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 6.0])]
     asked = []
     factor = SimpleNamespace(sizes=np.array([4, 2, 1]), draw=lambda x: asked.append(x) or values)
-    morphs, spectra = PosteriorSampler(
-        modes, factor, np.array([10.0, 100.0]), np.array([3, 1])
-    ).draw(rng)
+    sums = [np.array([7.0, 0.5, 0.25]), np.array([2.0])]
+    sampler = PosteriorSampler(modes, sums, factor, np.array([10.0, 100.0]), np.array([3, 1]))
+    morphs, spectra = sampler.draw(rng)
     assert asked[0].shape == (7,)
     np.testing.assert_allclose(morphs[0], 3 * (modes[0][0] + 2 * modes[0][1]))
     assert morphs[1].shape == (2, 2) and not morphs[1].any()
     np.testing.assert_allclose(spectra, [[90, 1200], [50, 600]])
+    found = sampler.draw_fluxes(np.array([[20.0, 30.0], [1.0, 1.0]]), rng)
+    light = 3 * (0.5 + 2 * 0.25)  # of the first one's modes
+    expected = [[20 * light + 7 * 90, 30 * light + 7 * 1200], [2 * 50, 2 * 600]]
+    np.testing.assert_allclose(found, expected)

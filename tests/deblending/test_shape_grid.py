@@ -130,8 +130,8 @@ def test_fluxes_and_errors_hold_the_estimate_beside_the_curvature(fitted):
     assert variance == pytest.approx(scatter**2 + noise**2 + curvature, rel=1e-3)
     assert result.errors.colour[0, 0, 0] == pytest.approx(variance)
     changes = result.draws.flux_changes
-    assert changes.source.tolist() == [0, 0] and changes.change.tolist() == [0, 1]
-    np.testing.assert_allclose(changes.by[:, 0], [scatter, noise], rtol=1e-3)
+    assert not changes.source.any() and (np.diff(changes.change) == 1).all()
+    np.testing.assert_allclose(changes.by[-2:, 0], [scatter, noise], rtol=1e-3)
     moved = fluxes(result)[0] - fluxes(without)[0]
     assert moved[0, 0] == pytest.approx(change, rel=1e-3) and change > 0.03 * scatter
 

@@ -91,6 +91,7 @@ class PosteriorSampler:
     """Means and factors from which samples of the posterior are drawn.
 
     modes (n): (k_i, ny, nx), images of each component's modes, arrays or ModeImages
+    sums (n): (1 + k_i,), sums of its morphology and of its modes, light beyond its box included
     factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (B,)
     unit (C,) [counts]: unit of the spectra there
     misfit_scale (n,): factor of the scatter of misfitted sources' components, as for their Errors
@@ -99,6 +100,7 @@ class PosteriorSampler:
     """
 
     modes: Sequence[np.ndarray | ModeImages]
+    sums: Sequence[np.ndarray]
     factor: BlockCholesky
     unit: np.ndarray
     misfit_scale: np.ndarray
@@ -123,13 +125,27 @@ class PosteriorSampler:
 
     def draw(self, rng):
         """Changes of the morphologies (n arrays) and of the spectra (n, C) [counts]."""
-        found = self.factor.draw(rng.standard_normal(sum(self.factor.sizes)))
-        morphs, spectra = [], []
-        for values, images, wide in zip(found, self.modes, self.misfit_scale, strict=False):
-            values = wide * values
-            morphs.append(combined(images, values[: len(images)]))
-            spectra.append(self._spectra(values[len(images) :]))
+        pairs = list(zip(self._drawn(rng), self.modes, strict=False))
+        morphs = [combined(images, values[: len(images)]) for values, images in pairs]
+        spectra = [self._spectra(values[len(images) :]) for values, images in pairs]
         return morphs, np.array(spectra)
+
+    def draw_fluxes(self, spectra, rng):
+        """Changes (n, C) [counts] of the fluxes of components of these spectra, to first order."""
+        return np.array(
+            [
+                spectrum * (values[: len(sums) - 1] @ sums[1:])
+                + sums[0] * self._spectra(values[len(sums) - 1 :])
+                for values, sums, spectrum in zip(
+                    self._drawn(rng), self.sums, spectra, strict=False
+                )
+            ]
+        )
+
+    def _drawn(self, rng):
+        """Values of each component's unknowns (n), then of those of all together."""
+        found = self.factor.draw(rng.standard_normal(sum(self.factor.sizes)))
+        return [wide * values for wide, values in zip(self.misfit_scale, found, strict=False)]
 
     def _spectra(self, values):
         """Spectra (..., C) [counts] of values (..., B) of the bands."""

@@ -87,11 +87,12 @@ class Posterior:
             right[i][k:] = pull * release_factor(pull**2 * np.diag(own)[k:])
         return self.factor.solve(right)
 
-    def errors(self, owner, residuals, unit, flux_error_floor) -> Errors:
+    def errors(self, owner, residuals, unit, own) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
 
-        residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra;
-            flux_error_floor: see Settings
+        residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra
+        own (m, S, C) [counts]: further changes of each source's fluxes alone, see `floors`, with
+            which channels are weighted for moments
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
         slopes, flux = self.flux_slopes, np.zeros((n_sources, self.layout.n_channels))
@@ -115,18 +116,9 @@ class Posterior:
         for s, slope, change in zip(owner, slopes, self.released, strict=False):
             released[s] += slope @ change
         released = within_errors(released.T, between).T
-        floor, far = np.zeros((2, *flux.shape))
-        for i, (slope, beyond) in enumerate(zip(slopes, self.beyond, strict=True)):
-            spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
-            own = spectrum * slope[0, -self.layout.n_spectra]  # its flux
-            floor[owner[i]] += flux_error_floor * clipped_power(unlike, FLOOR_EXPONENT) * own
-            far[owner[i]] += FAR_ERROR * spectrum * beyond[0, 0]
-        for common in (floor, far):  # to all channels of a source
-            between[:, np.arange(n_sources), np.arange(n_sources)] += common.T**2
-            colour += common[:, :, None] * common[:, None, :]
-        error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))
-        moments, moved = self._moments(owner, n_sources, error)
         scale = wide[:, None] * unit
+        variance = np.diagonal(colour, axis1=1, axis2=2) + np.square(own / scale).sum(axis=0)
+        moments, moved = self._moments(owner, n_sources, np.sqrt(variance))
         return Errors(
             between * scale.T[:, :, None] * scale.T[:, None],
             colour * scale[:, :, None] * scale[:, None],
@@ -138,10 +130,24 @@ class Posterior:
             residuals,
         )
 
+    def floors(self, owner, residuals, unit, flux_error_floor):
+        """Changes (2, S, C) [counts] of scatter 1 of fluxes, common to all channels of a source.
+
+        They are Settings.flux_error_floor, and FAR_ERROR of the light beyond the boxes; for the
+        other arguments see `errors`.
+        """
+        floor, far = np.zeros((2, len(residuals), self.layout.n_channels))
+        for i, (slope, beyond) in enumerate(zip(self.flux_slopes, self.beyond, strict=True)):
+            spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
+            own = spectrum * slope[0, -self.layout.n_spectra]  # its flux
+            floor[owner[i]] += flux_error_floor * clipped_power(unlike, FLOOR_EXPONENT) * own
+            far[owner[i]] += FAR_ERROR * spectrum * beyond[0, 0]
+        return np.stack([floor, far]) * misfit_error_scale(residuals)[:, None] * unit
+
     def draws(self, owner, residuals, unit) -> PosteriorSampler:
         """Sampler of the posterior for `Result.sample`; for its arguments see `errors`."""
-        wide = misfit_error_scale(residuals)[owner]
-        return PosteriorSampler(self.modes, self.factor, unit, wide, self.layout.ties)
+        wide, sums = misfit_error_scale(residuals)[owner], [one[0] for one in self._sums]
+        return PosteriorSampler(self.modes, sums, self.factor, unit, wide, self.layout.ties)
 
     @cached_property
     def _sums(self):
@@ -208,7 +214,8 @@ def with_errors(fit, result, peaks, seen):
     if posterior is None:
         return noted(result, messages=(*result.messages, *messages))
     owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
-    errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_error_floor)
+    floors = posterior.floors(owner, residuals, fit.unit, fit.settings.flux_error_floor)
+    errors = posterior.errors(owner, residuals, fit.unit, floors)
     draws = posterior.draws(owner, residuals, fit.unit)
     start = fit.start
     outside = light_outside(
@@ -230,7 +237,7 @@ def with_errors(fit, result, peaks, seen):
     # (bench.ladder, single).
     bands = np.eye(len(fit.unit)) if fit.ties is None else fit.ties.matrix
     by_band = np.where(bands.T[:, None], np.hypot(width_errors(result), noise), 0)
-    own = np.stack([missed_light(result), scatter, *by_band])
+    own = np.stack([*floors, missed_light(result), scatter, *by_band])
     doubts = np.concatenate([doubts, division, largest_changes(unsettled, fit.unit)], axis=2)
     changes = doubts, exchanged_light(result, posterior.solution, doubted), own
     largest = np.abs(unsettled).max(axis=2, initial=0)

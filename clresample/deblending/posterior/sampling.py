@@ -17,11 +17,7 @@ def drawn_components(result, rng):
 
     Raises ValueError for results without draws.
     """
-    if result.draws is None:
-        raise ValueError(
-            "result has no posterior to draw from: fit with a MultiscalePrior and errors=True"
-        )
-    morphs, spectra = result.draws.draw(rng)
+    morphs, spectra = _draws_of(result).draw(rng)
     return tuple(
         replace(
             c,
@@ -37,18 +33,28 @@ def drawn_fluxes(result, n, rng):
 
     Raises ValueError for results without draws.
     """
-    shape = n, len(result.sources), len(result.channels)
-    found, beyond = np.zeros(shape), np.zeros(len(result.components))
-    if result.errors is not None:
-        found += result.errors.flux_correction
-        beyond = result.errors.outside_box_moments[:, 0]
+    draws = _draws_of(result)
+    owner = np.array([c.source for c in result.components], int)
+    spectra = np.array([c.spectrum for c in result.components])
+    mean = result.errors.flux_correction.copy()
+    for source, spectrum, sums in zip(owner, spectra, draws.sums, strict=True):
+        mean[source] += spectrum * sums[0]
+    found = np.tile(mean, (n, 1, 1))
     for one in found:
-        for c, far in zip(drawn_components(result, rng), beyond, strict=True):
-            one[c.source] += c.spectrum * (c.morphology.sum(dtype=np.float64) + far)
-        if result.draws.flux_changes is not None:
-            one += result.draws.flux_changes.draw(len(one), rng)
+        np.add.at(one, owner, draws.draw_fluxes(spectra, rng))
+        if draws.flux_changes is not None:
+            one += draws.flux_changes.draw(len(one), rng)
     found[:, undetermined(result)] = np.nan
     return found
+
+
+def _draws_of(result):
+    """The PosteriorSampler of a result. Raises ValueError for one without it."""
+    if result.draws is None:
+        raise ValueError(
+            "result has no posterior to draw from: fit with a MultiscalePrior and errors=True"
+        )
+    return result.draws
 
 
 def undetermined(result) -> np.ndarray:
