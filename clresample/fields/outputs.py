@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 from astropy.io import fits
 
 from .. import __version__
@@ -79,7 +80,8 @@ def write_outputs(
     last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
-    notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET]), *_noted_messages(job, blends)]
+    notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET]), *_unmeasured(job, table)]
+    notes += _noted_messages(job, blends)
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:
         made = list(_write_catalogues(part, table))
@@ -89,6 +91,17 @@ def write_outputs(
         made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
     paths += [folder / path.name for path in made]
     return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), tuple(notes))
+
+
+def _unmeasured(job, table) -> list[str]:
+    """A line on each mosaic without a measurement of any source, while another one has some."""
+    empty = [m.name for m in job.mosaics if np.isnan(table[f"chi2_{m.name}"]).all()]
+    return [
+        f"{name}: no pixel at any source has a weight, so that its fluxes are NaN; check its "
+        "image, weights or variance, and mask"
+        for name in empty
+        if len(empty) < len(job.mosaics)
+    ]
 
 
 def _noted_messages(job, fits) -> list[str]:

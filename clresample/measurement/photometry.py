@@ -172,7 +172,7 @@ def whole_groups(rows, bands):
     were fitted apart, its fluxes are the sums of theirs, and errors those without covariance.
     """
     _, number, count = np.unique(rows["group_id"], return_inverse=True, return_counts=True)
-    fluxes = (np.nan_to_num(rows[f"flux_{b}"]) for b in bands if f"flux_{b}" in rows)
+    fluxes = (np.nan_to_num(rows[f"flux_{b}"]) for b in bands)
     faintest_first = np.argsort(sum(fluxes, np.zeros(len(number))), kind="stable")
     brightest = np.zeros(len(count), int)
     brightest[number[faintest_first]] = faintest_first
@@ -182,8 +182,6 @@ def whole_groups(rows, bands):
         return
     rows["n_group"][apart] = count[number][apart]
     for band in bands:
-        if f"flux_{band}" not in rows:
-            continue
         total = np.bincount(number, np.asarray(rows[f"flux_{band}"], float))
         variance = np.bincount(number, np.asarray(rows[f"flux_err_{band}"], float) ** 2)
         rows[f"group_flux_{band}"][apart] = total[number][apart]

@@ -14,8 +14,9 @@ from astropy.table import QTable
 from helpers.fields import mosaics_of
 
 import clresample
-from clresample import FieldOptions
-from clresample.fields.mosaic import FilePlane
+from clresample import FieldOptions, Flag, Grid
+from clresample.fields.columns import empty_catalogue
+from clresample.fields.mosaic import ConstantPlane, FilePlane
 from clresample.fields.outputs import _noted_messages
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
@@ -42,6 +43,33 @@ def test_every_column_has_its_unit_and_a_description(done):
     blends = QTable.read(folder / "fit_table.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)
     assert blends["seconds"].unit == "s"
+
+
+def test_columns_follow_from_the_mosaics_alone(done, sky):
+    rows, mosaics = QTable.read(done[0] / "catalogue.ecsv"), mosaics_of(sky)
+    job = SimpleNamespace(mosaics=mosaics, bands=("VIS", "i"), reference=mosaics[0].grid)
+    empty = empty_catalogue(job).table()
+    assert empty.colnames == rows.colnames and len(empty) == 0
+    for name in rows.colnames:
+        unit, expected = (getattr(table[name], "unit", None) for table in (empty, rows))
+        assert unit == expected, name
+    assert empty.meta["FRAME"] == rows.meta["FRAME"]
+    bare = replace(mosaics[1], channels=(replace(mosaics[1].channels[0], zero_point=None),))
+    flat = SimpleNamespace(mosaics=(bare,), bands=("i",), reference=Grid.flat((9, 9), 0.2))
+    without = empty_catalogue(flat).table()
+    assert without["flux_i"].unit == "ct" and "mag_i" not in without.colnames
+    assert "y_sky" in without.colnames and not without.meta
+
+
+def test_an_instrument_without_a_usable_pixel_has_empty_columns_flags_and_a_note(sky, tmp_path):
+    euclid, rubin = mosaics_of(sky)
+    rubin = replace(rubin, channels=(replace(rubin.channels[0], mask=ConstantPlane(1)),))
+    options = FieldOptions(passes=1, threshold=30.0)
+    found = run_field([euclid, rubin], tmp_path, options=options).outputs
+    rows = read_catalogue(tmp_path / "catalogue.fits")
+    assert len(rows) and np.isnan(rows["flux_i"]).all() and np.isfinite(rows["flux_VIS"]).any()
+    assert (rows["flags"] & Flag.NO_COVERAGE).all()
+    assert [n for n in found.notes if n.startswith("Rubin: no pixel at any source has a weight")]
 
 
 def test_messages_of_fits_are_counted_by_their_kind():

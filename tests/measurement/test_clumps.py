@@ -174,7 +174,7 @@ def test_groups_that_were_fitted_apart_are_put_together():
             "group_flux_err_r": np.array([3.0, 4.0, 1.0]),
         }
     )
-    whole_groups(rows, ["r", "i"])
+    whole_groups(rows, ["r"])
     assert rows["group_id"].tolist() == [2, 2, 3]  # of the brightest, with 10
     assert rows["n_group"].tolist() == [2, 2, 1]
     assert rows["group_flux_r"].tolist() == [14, 14, 7]

@@ -330,6 +330,8 @@ def _take(part, job, cut, result, n_round):
     ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
+    if len(cut.boxes) < len(job.mosaics):
+        rows["flags"][:] |= Flag.NO_COVERAGE
     partner = rows["ambiguous_with"]
     rows.put("ambiguous_with", np.where(partner < 0, -1, ids[partner]))
     _add_columns(rows, ids, job, patch, result.status, "")
