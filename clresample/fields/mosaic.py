@@ -182,51 +182,54 @@ class Mosaic:
         cls,
         name,
         data,
-        grid,
         psf,
+        grid,
         *,
-        weights,
-        channels=None,
-        zero_points=None,
+        weights=None,
+        variance=None,
         mask=None,
+        channels=None,
+        bands=None,
+        zero_points=None,
         noise=None,
         saturation=None,
+        unit=None,
     ) -> Mosaic:
-        """A mosaic of arrays in memory, as `Observation` takes them.
+        """A mosaic of arrays in memory, from the arguments of an Observation, by its checks.
 
-        data, weights (C, Ny, Nx); mask (Ny, Nx) or (C, Ny, Nx): True = ignore this pixel
-        channels (C,): names; zero_points (C,) [mag]; psf: PSF or PSFField
-        saturation (C,) or one number [counts]
-        Raises ValueError for shapes that disagree.
+        name: of the instrument; the others: see Observation, which also estimates missing noise
         """
-        data = np.asarray(data)
-        data = data[None] if data.ndim == 2 else data
-        if data.ndim != 3 or data.shape[1:] != grid.shape:
-            raise ValueError(f"data has the shape {data.shape}, grid has {grid.shape} pixels")
-        weights = np.broadcast_to(weights, data.shape)
-        masks = None if mask is None else np.broadcast_to(mask, data.shape)
-        names = channels or [f"{name}{i}" for i in range(len(data))]
-        given = zero_points if zero_points is not None else [None] * len(data)
-        if len(names) != len(data) or len(given) != len(data):
-            raise ValueError(
-                f"channels has {len(names)} names and zero_points {len(given)} numbers, data have "
-                f"{len(data)} channels"
-            )
-        levels = (
-            [None] * len(data) if saturation is None else np.broadcast_to(saturation, len(data))
+        o = Observation(
+            data,
+            psf,
+            grid,
+            weights=weights,
+            variance=variance,
+            mask=mask,
+            channels=channels,
+            bands=bands,
+            zero_points=zero_points,
+            noise=noise,
+            name=name,
+            saturation=saturation,
+            unit=unit,
         )
+        n = len(o.channels)
+        levels = [np.inf] * n if o.saturation is None else o.saturation.tolist()
+        points = [None] * n if o.zero_points is None else o.zero_points.tolist()
         made = tuple(
             Channel(
-                names[i],
-                ArrayPlane(data[i]),
-                ArrayPlane(weights[i]),
-                mask=None if masks is None else ArrayPlane(masks[i]),
-                zero_point=given[i],
-                saturation=levels[i],
+                o.channels[i],
+                ArrayPlane(o.data[i]),
+                ArrayPlane(o.weights[i]),
+                zero_point=points[i],
+                saturation=levels[i] if np.isfinite(levels[i]) else None,
+                band=None if bands is None else o.bands[i],
             )
-            for i in range(len(data))
+            for i in range(n)
         )
-        return cls(name, grid, made, psf, noise)
+        psf_field = psf if isinstance(psf, PSFField) else ConstantPSF(o.psf)
+        return cls(name, o.grid, made, psf_field, o.noise)
 
     def box_on(self, grid) -> Box:
         """The pixels of this mosaic whose centres may lie on a grid: a Box on the mosaic.

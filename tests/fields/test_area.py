@@ -22,7 +22,7 @@ def mosaic(name, n, scale, center=(0.0, 0.0), angle=0.0, wcs=False):
     grid = Grid.flat((n, n), scale, angle_deg=angle, center_arcsec=center)
     grid = Grid.from_wcs(grid.to_wcs(ra_deg=150.0, dec_deg=2.0), grid.shape) if wcs else grid
     data = np.random.default_rng(n).standard_normal((1, n, n))
-    return Mosaic.of_arrays(name, data, grid, PSF, weights=np.ones(data.shape))
+    return Mosaic.of_arrays(name, data, PSF, grid, weights=np.ones(data.shape))
 
 
 def area(*mosaics, which="auto", **given):

@@ -22,7 +22,7 @@ def test_pixels_of_other_blends_have_no_weight_also_beyond_the_box(tmp_path, x0,
     reference, coarse = (Grid.from_wcs(g.to_wcs(ra_deg=10.0, dec_deg=-3.0), g.shape) for g in grids)
     psf = PSF.gaussian(1.5)
     mosaics = tuple(
-        Mosaic.of_arrays(name, np.ones(g.shape), g, psf, weights=1.0)
+        Mosaic.of_arrays(name, np.ones(g.shape), psf, g, weights=1.0)
         for name, g in (("fine", reference), ("coarse", coarse))
     )
     patch = FitRegion(0, 1, Box(40, x0, 72, x0 + 32), (0,))

@@ -14,7 +14,7 @@ REFERENCE = Grid.flat((400, 400), 0.1)
 def mosaic_of(grid, noise=None):
     psf = PSF.gaussian(1.5)
     zeros, ones = np.zeros(grid.shape), np.ones(grid.shape)
-    return Mosaic.of_arrays("m", zeros, grid, psf, weights=ones, noise=noise)
+    return Mosaic.of_arrays("m", zeros, psf, grid, weights=ones, noise=noise)
 
 
 def on_frame(mosaic, frame):

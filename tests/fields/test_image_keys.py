@@ -235,8 +235,8 @@ def test_exposures_of_a_field_give_one_flux_a_band(tmp_path):
         made = Mosaic.of_arrays(
             name,
             factor * light + rng.normal(size=light.shape),
-            grid,
             psf,
+            grid,
             weights=weights,
             channels=[name],
             zero_points=[point],

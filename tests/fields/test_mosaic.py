@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from clresample import PSF, FunctionPSF, Grid
+from clresample import PSF, FunctionPSF, Grid, NoiseWarning, Observation
 from clresample.fields.background import Background
 from clresample.fields.mosaic import ArrayPlane, Channel, ConstantPlane, FilePlane, Mosaic
 from clresample.files.atomic import FileError
@@ -58,7 +58,7 @@ def test_the_psf_of_a_cutout_varies_as_the_mosaic_s_does():
         return PSF.gaussian(1.5 + 0.01 * x + 0.003 * y)
 
     data, grid = np.zeros((1, 60, 80)), Grid.flat((60, 80), 0.2)
-    mosaic = Mosaic.of_arrays("r", data, grid, FunctionPSF(widening), weights=1.0)
+    mosaic = Mosaic.of_arrays("r", data, FunctionPSF(widening), grid, weights=1.0)
     box = Box(10, 20, 41, 71)
     o = mosaic.observation(box)
     np.testing.assert_array_equal(o.psf.images, widening(25, 45).images)
@@ -66,7 +66,7 @@ def test_the_psf_of_a_cutout_varies_as_the_mosaic_s_does():
     fixed = mosaic.observation(box, psf_box=Box.of(grid.shape))
     np.testing.assert_array_equal(fixed.psf.images, widening(29.5, 39.5).images)
     assert fixed.psf_field is None
-    same = Mosaic.of_arrays("r", data, grid, widening(0, 0), weights=1.0)
+    same = Mosaic.of_arrays("r", data, widening(0, 0), grid, weights=1.0)
     assert same.observation(box).psf_field is None
 
 
@@ -98,7 +98,7 @@ def test_a_negative_rms_is_no_noise(image):
 
 def test_an_observation_is_the_box_with_its_own_wcs_and_psf(image):
     whole, psf = grid(angle_deg=12.0), PSF.gaussian(1.5)
-    mosaic = Mosaic.of_arrays("m", image, whole, psf, weights=1.0, zero_points=[25.0])
+    mosaic = Mosaic.of_arrays("m", image, psf, whole, weights=1.0, zero_points=[25.0])
     box = Box(20, 30, 45, 80)
     seen = mosaic.observation(box, subtract=np.ones((1, *box.shape)))
     np.testing.assert_array_equal(seen.data[0], image[box.slices] - 1.0)
@@ -108,10 +108,27 @@ def test_an_observation_is_the_box_with_its_own_wcs_and_psf(image):
     assert nothing is None
 
 
+def test_arrays_are_checked_and_read_as_those_of_an_observation(image):
+    hidden = np.ma.masked_greater(image, 12)
+    given = {"variance": 4.0, "bands": "g", "saturation": 50.0, "unit": "nJy"}
+    given["noise"] = np.ones((1, 1))
+    mosaic = Mosaic.of_arrays("m", hidden, PSF.gaussian(1.5), grid(), **given)
+    expected = Observation(hidden, PSF.gaussian(1.5), grid(), name="m", **given)
+    found = mosaic.observation()
+    for name in ("data", "weights", "zero_points", "bands", "channels", "saturation"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert found.noise is not None and (found.weights[0] == 0).sum() == hidden.mask.sum() > 0
+    with pytest.warns(NoiseWarning) as caught:
+        Mosaic.of_arrays("m", image, PSF.gaussian(1.5), grid().wcs)
+    assert len(caught) == 1
+    with pytest.raises(ValueError, match="weights has 60 negative values"):
+        Mosaic.of_arrays("m", image, PSF.gaussian(1.5), grid(), weights=-np.eye(*SHAPE))
+
+
 def test_the_box_on_a_grid_holds_all_its_pixels_and_few_others():
     psf = PSF.gaussian(1.5)
     wide = grid(angle_deg=30.0, scale=0.2, shape=(200, 200))
-    mosaic = Mosaic.of_arrays("m", np.zeros((200, 200)), wide, psf, weights=1.0)
+    mosaic = Mosaic.of_arrays("m", np.zeros((200, 200)), psf, wide, weights=1.0)
     patch = grid().cutout(10, 20, (32, 48))
     box = mosaic.box_on(patch)
     everywhere = wide.positions_in(patch, *np.indices(wide.shape))

@@ -122,7 +122,7 @@ def test_a_sky_that_was_left_in_is_measured_once_and_subtracted(tmp_path, level)
 
     def mosaic(data):
         grid, psf = Grid.flat(image.shape, 0.1), PSF.gaussian(2.0)
-        return Mosaic.of_arrays("A", data[None], grid, psf, channels=["r"], weights=0.25)
+        return Mosaic.of_arrays("A", data[None], psf, grid, channels=["r"], weights=0.25)
 
     found = measured_sky([mosaic(image)], tmp_path)
     assert measured_sky([mosaic(image + 9)], tmp_path) == found  # of the first start
@@ -151,7 +151,7 @@ def test_a_sky_that_was_left_in_is_measured_once_and_subtracted(tmp_path, level)
 def test_levels_of_a_start_that_ended_before_the_search_are_measured_again(tmp_path):
     image, options = _noise((640, 640)) + 0.4, FieldOptions()
     grid, psf = Grid.flat(image.shape, 0.1), PSF.gaussian(2.0)
-    mosaic = Mosaic.of_arrays("A", image[None], grid, psf, weights=1.0)
+    mosaic = Mosaic.of_arrays("A", image[None], psf, grid, weights=1.0)
     given = tmp_path, [mosaic], mosaic.grid, options, False, False, RunProgress()
     work, _ = open_folder(*given)
     ((_, part),) = measured_sky([mosaic], work).values()

@@ -12,8 +12,8 @@ def mosaics_of(field):
         Mosaic.of_arrays(
             m.survey.name,
             m.data,
-            m.grid,
             ScatteredPSF(m.psf_images, m.psf_positions),
+            m.grid,
             weights=np.broadcast_to(m.noise_sigma[:, None, None] ** -2.0, m.data.shape),
             channels=m.survey.bands,
             zero_points=list(m.survey.zero_points_mag),

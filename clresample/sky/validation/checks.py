@@ -22,7 +22,7 @@ WAYS = {
     "Blend": "Blend(observations, sources)",
     "Result": "a result of deblend, or one of deblend_many",
     "Frame": "model_frame(observations)",
-    "Mosaic": "Mosaic.of_arrays(...), or those of read_field",
+    "Mosaic": "Mosaic.of_arrays(name, data, psf, grid), or those of read_field",
     "CCDData": "cutouts of Result.cutout or FieldCutouts.cutout",
     "Table": "catalogue(result)",
 }
