@@ -68,6 +68,32 @@ def field_area(mosaics, reference, area, positions=None) -> FieldArea:
     return FieldArea(wanted, searchable, tuple(notes))
 
 
+def check_listed(positions, reference, wanted):
+    """Raises ValueError if no position (S, 2) [deg, or arcsec on a flat sky] lies in `wanted`.
+
+    The message has the remedy where swapped positions, or 15 times the first numbers, lie there.
+    """
+    positions = np.asarray(positions, float)
+
+    def inside(some):
+        return wanted.contains(reference.pixel(*some.T)).any()
+
+    if inside(positions):
+        return
+    names = "(y, x) [arcsec]" if reference.is_flat else "(longitude, latitude) [deg]"
+    middle = reference.sky((wanted.y0 + wanted.y1) / 2, (wanted.x0 + wanted.x1) / 2)
+    remedy = f"give {names} of sources there"
+    if inside(positions[:, ::-1]):
+        remedy = "swap the two"
+    elif not reference.is_flat and inside(positions * [15, 1]):
+        remedy = "multiply right ascensions in hours by 15"
+    raise ValueError(
+        f"positions are all outside the field's area ({len(positions)} sources, the first at "
+        f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})), must be {names} and be near "
+        f"({middle[0]:.6g}, {middle[1]:.6g}): {remedy}"
+    )
+
+
 def _placed_pixels(grid, reference):
     """Positions (n, 2) [model px] of pixels all over a grid; NaN where they are not reversible."""
     y, x = (np.linspace(0, n - 1, N_SAMPLES) for n in grid.shape)

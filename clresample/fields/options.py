@@ -6,10 +6,12 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
+from astropy.coordinates import SkyCoord
 
 from ..deblending.settings import FitSettings, Settings
 from ..device.workers.process_limits import free_memory
 from ..measurement.detection import THRESHOLD
+from ..sky.validation.checks import as_real_array
 from .area import AREAS
 from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
@@ -74,6 +76,7 @@ class FieldOptions:
     field_number: int = 0
 
     def __post_init__(self):
+        _check_positions(self.positions)
         if self.passes not in (1, 2):
             raise ValueError(f"passes is {self.passes}, must be 1 or 2")
         if self.area not in AREAS:
@@ -111,6 +114,19 @@ class FieldOptions:
             return replace(self, group_memory=max(MIN_MEMORY, min(MEMORY, free)))
         max_bytes = min(self.limits.max_bytes, memory)
         return replace(self, group_memory=memory, limits=replace(self.limits, max_bytes=max_bytes))
+
+
+def _check_positions(positions):
+    """Raises ValueError unless positions are None, a SkyCoord or an array, of one or more."""
+    is_coord = isinstance(positions, SkyCoord)
+    if positions is None or (is_coord and positions.size):
+        return
+    shape = positions.shape if is_coord else as_real_array("positions", positions).shape
+    if len(shape) != 2 or shape[1] != 2 or shape[0] == 0:
+        raise ValueError(
+            f"positions has the shape {shape}, must be (S, 2) with at least one source: give None "
+            "to detect sources"
+        )
 
 
 @dataclass(eq=False)

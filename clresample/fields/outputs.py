@@ -80,8 +80,8 @@ def write_outputs(
     last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
-    notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET]), *_unmeasured(job, table)]
-    notes += _noted_messages(job, blends)
+    notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET])]
+    notes += [*_unmeasured(job, table, blends), *_noted_messages(job, blends)]
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:
         made = list(_write_catalogues(part, table))
@@ -93,8 +93,13 @@ def write_outputs(
     return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), tuple(notes))
 
 
-def _unmeasured(job, table) -> list[str]:
-    """A line on each mosaic without a measurement of any source, while another one has some."""
+def _unmeasured(job, table, fits) -> list[str]:
+    """A line on each mosaic that measures no source while another one does, or on no source."""
+    if not len(fits) and not job.is_part and not job.plan.failed_tiles:
+        return [
+            f"no source was detected over {job.threshold:g} sigma, and the catalogue is empty: "
+            "lower threshold in [detection], or list sources"
+        ]
     empty = [m.name for m in job.mosaics if np.isnan(table[f"chi2_{m.name}"]).all()]
     return [
         f"{name}: no pixel at any source has a weight, so that its fluxes are NaN; check its "

@@ -14,7 +14,7 @@ from ..deblending.ended import Ended
 from ..deblending.settings import AUTO, SMALL
 from ..sky.validation.checks import check_instance, check_sequence
 from ..sky.wcs import celestial_frame
-from .area import field_area
+from .area import check_listed, field_area
 from .blends.tiles import field_part
 from .execution.backend import make_backend
 from .execution.fitting import FieldJob
@@ -73,13 +73,14 @@ def run_field(
     options = replace(options.with_memory(), positions=_degrees(options.positions, reference))
     _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
+    known = known_positions(options.positions, reference)
+    wanted, searchable, notes = field_area(mosaics, reference, options.area, known)
+    if known is not None:
+        check_listed(options.positions, reference, wanted)
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
     )
     clock, settings = _Clock(seconds), options.settings
-    wanted, searchable, notes = field_area(
-        mosaics, reference, options.area, known_positions(options.positions, reference)
-    )
     if settings.fit_sky == AUTO:
         found = measured_sky(mosaics, work)
         lowered = sky_notes(mosaics, found)

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS, Sip
 
-from clresample import Grid, Mosaic
+from clresample import FieldOptions, Grid, Mosaic, run_field
 from clresample.fields.area import field_area
 from clresample.fields.blends.plan import source_ids
 from clresample.fields.blends.search import snr_scatter
@@ -94,3 +95,34 @@ def test_the_scatter_of_a_mosaic_beside_the_finest_is_measured():
     mosaics = [mosaic("fine", 64, 0.1), mosaic("beside", 64, 0.1, center=(0.0, 8.0))]
     found = snr_scatter(mosaics, reference_grid(mosaics))
     assert found["beside"] != [1.0] * 3 and np.all(np.array(found["beside"]) > 0)
+
+
+@pytest.mark.parametrize(
+    ("positions", "remedy"),
+    [
+        ([[2.0, 150.0]], "swap the two"),
+        ([[10.0, 2.0]], "multiply right ascensions in hours by 15"),
+        ([[40.0, -5.0], [41.0, 0.0]], "(longitude, latitude) [deg] of sources there"),
+    ],
+)
+def test_a_list_without_a_source_in_the_area_is_refused_before_the_run(tmp_path, positions, remedy):
+    one = mosaic("m", 32, 0.2, wcs=True)
+    message = r"positions are all outside the field's area \([12] sources, .*" + re.escape(remedy)
+    with pytest.raises(ValueError, match=message):
+        run_field([one], tmp_path / "out", options=FieldOptions(positions=positions))
+    assert not (tmp_path / "out").exists()
+
+
+NOWHERE = SkyCoord([], [], unit="deg")
+
+
+@pytest.mark.parametrize("positions", [[], [1.0, 2.0], np.zeros((3, 3)), NOWHERE])
+def test_positions_of_another_shape_are_refused(positions):
+    with pytest.raises(ValueError, match="positions has the shape .*, must be .S, 2. with"):
+        FieldOptions(positions=positions)
+
+
+def test_a_field_without_a_detection_has_a_note(tmp_path):
+    found = run_field([mosaic("m", 64, 0.2)], tmp_path, options=FieldOptions(threshold=1e4))
+    assert found.outputs.n_sources == 0
+    assert "no source was detected over 10000 sigma, and the catalogue" in found.outputs.notes[0]
