@@ -7,6 +7,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from clresample import PaperSettings, Settings, SingleScalePrior
 from clresample.cli import example
 from clresample.fields.field_toml.keys import SCENE_TABLES as TABLES, parse_scene as parse
 from clresample.files.atomic import FileError
@@ -43,6 +44,16 @@ def test_its_optional_keys_are_correct_too(tmp_path, left_out):
     found = parse(tmp_path / "scene.toml")
     assert len(found["observation"][0]) == len(TABLES["observation"]) - 4
     assert len(found["fit"]) == len(TABLES["fit"])
+
+
+def test_optional_keys_of_the_fit_have_their_defaults():
+    _, _, text = "\n".join(lines()).partition("[fit]")
+    shown, paper = tomllib.loads(text), PaperSettings()
+    assert shown.pop("monotone") is True  # which selects the paper's method
+    assert shown.pop("correlation_px") == SingleScalePrior().correlation_px
+    assert len(shown) > 4
+    for name, value in shown.items():
+        assert value == getattr(Settings() if hasattr(Settings, name) else paper, name), name
 
 
 def test_noise_and_zero_points_are_those_of_the_surveys():
