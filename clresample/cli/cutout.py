@@ -30,7 +30,8 @@ sources  After `clresample field` ids of the catalogue; after `clresample deblen
 output   A table CUTOUTS with a row for each; of the k-th: DATA, UNCERT, MASK and
          PSFIMAGE with the extension version k. clresample.read_cutouts reads them.
 
-example  clresample cutout sky/out --id 99615072 -o alone.fits
+example  clresample cutout sky/out --id N -o alone.fits     # N: a number of the column id,
+                                    # clresample.read_catalogue("sky/out/catalogue.fits")["id"]
          clresample cutout sky/out --ids-from bright.ecsv --observation Euclid \\
              --size 64 -o bright.fits
          clresample cutout trial/out --id 0,3 --what redistributed --unit uJy -o two.fits"""
