@@ -9,7 +9,7 @@ import numpy as np
 
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, check_observations
-from ..sky.sources import Source
+from ..sky.sources import Source, check_unique_names
 from ..sky.validation.checks import as_float_array, check_instance, check_sequence
 from .ended import Ended
 from .solver.scene import ComponentStructure
@@ -47,9 +47,10 @@ class Blend:
     structures: tuple = ()
 
     def check(self):
-        """Raises ValueError if an observation, a source or the frame has another type."""
+        """Raises ValueError for parts of another type, and for two sources of one name."""
         check_sequence("observations", self.observations, Observation)
         check_sequence("sources", self.sources, Source)
+        check_unique_names(self.sources)
         if self.frame is not None:
             check_instance("frame", self.frame, Frame)
         n = len(self.sources)

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
-from ..sky.sources import ExtendedSource, PointSource
+from ..sky.sources import ExtendedSource, PointSource, check_unique_names
 from .headers import check_headers
 
 KINDS = {"point": PointSource, "extended": ExtendedSource}
@@ -65,6 +65,10 @@ def read_sources(path, columns=None) -> tuple:
             sources.append(_source(found, i, {position: tuple(map(float, where))}))
         except ValueError as error:
             raise ValueError(f"{path}: row {i + 1}: {error}") from error
+    try:
+        check_unique_names(sources)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return tuple(sources)
 
 

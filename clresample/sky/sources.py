@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,7 +29,7 @@ class Source:
         refers to; None = those of the model frame. By default the model frame is the union of all
         footprints (see `model_frame`), whose first pixel few users know: pass the frame too, or
         the observation's name
-    name: its name in the catalogue; None = its number
+    name: its name in the catalogue, unique in a fit; None = its number
     sky_frame: "icrs" where sky_deg was a SkyCoord; None = numbers in the frame of the grid's WCS
 
     Raises ValueError unless there is exactly one position, which must be finite, and for an
@@ -100,6 +101,15 @@ class Source:
             )
         y, x = map(float, position)
         return replace(self, position_px=(y, x), observation=None)
+
+
+def check_unique_names(sources):
+    """Raises ValueError if several sources have one name."""
+    for name, n in Counter(s.name for s in sources if s.name).items():
+        if n > 1:
+            raise ValueError(
+                f"name {name!r} is that of {n} sources, must be unique: give each its own, or none"
+            )
 
 
 def _icrs(coordinate):

@@ -78,7 +78,7 @@ def test_components_that_are_no_number(scene, capsys, value):
 def test_too_much_work_is_refused_before_it_starts(scene, capsys, n_sources, n_components):
     table = Table.read(scene / "sources.ecsv")
     table = table[np.arange(n_sources) % 2]
-    table["type"] = "extended"
+    table["type"], table["name"] = "extended", np.arange(n_sources)
     table["components"] = [float(n_components)] * n_sources
     table.write(scene / "sources.ecsv", format="ascii.ecsv", overwrite=True)
     began = time.process_time()

@@ -78,6 +78,13 @@ def test_an_empty_list_of_sources_is_named():
         replace(scenes.blend(), sources=()).resolve_frame()
 
 
+def test_two_sources_of_one_name_are_refused():
+    """A cutout by that name would be the first one's."""
+    given, own = scenes.blend(), (replace(s, name="a") for s in scenes.blend().sources)
+    with pytest.raises(ValueError, match="name 'a' is that of [0-9] sources, must be unique"):
+        replace(given, sources=tuple(own)).check()
+
+
 @pytest.mark.parametrize("fit_shifts", [False, True])
 @pytest.mark.parametrize("shifts", [None, ((0, 0), (0, 0.4)), ((0, 0), (0.2, -0.3))])
 def test_shifts_that_are_known_are_taken_by_operators_of_ones_own(device, shifts, fit_shifts):

@@ -321,6 +321,12 @@ def test_pixels_may_be_those_of_an_observation(folder, tmp_path):
     assert [s.observation for s in on_sky] == [None, None]
 
 
+def test_a_list_with_a_name_twice_is_refused(tmp_path):
+    Table({"y": [4.0, 5.0], "x": [5.0, 6.0], "name": ["a", "a"]}).write(tmp_path / "list.ecsv")
+    with pytest.raises(ValueError, match=r"list.ecsv: name 'a' is that of 2 sources, must be"):
+        read_sources(tmp_path / "list.ecsv")
+
+
 def test_a_negative_rms_gives_a_pixel_no_weight(folder):
     rms = np.full((30, 34), 2.0)
     rms[4, 5:7] = -1, -2
