@@ -12,6 +12,7 @@ from ..sky.footprint import Footprint, unobserved
 from ..sky.frame import Frame
 from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
+from ..sky.validation.checks import check_integer
 from .assessment.misfit import Misfit, misfit_of
 from .component_images import ComponentImages, weighted_sum
 from .ended import Ended
@@ -245,7 +246,7 @@ class Result(ResultDisplay):
         Raises ValueError for results without draws: of other priors, or without errors.
         """
         rng = np.random.default_rng(rng)
-        return [drawn_components(self, rng) for _ in range(n)]
+        return [drawn_components(self, rng) for _ in range(check_integer("n", n))]
 
     def sample_fluxes(self, n, rng=None) -> np.ndarray:
         """Draws the sources' fluxes (n, S, C) [counts] from the posterior, n times.
@@ -262,7 +263,7 @@ class Result(ResultDisplay):
 
         Raises ValueError as `sample` does.
         """
-        return drawn_fluxes(self, n, np.random.default_rng(rng))
+        return drawn_fluxes(self, check_integer("n", n), np.random.default_rng(rng))
 
 
 # Cached properties of a Result that do not depend on its status, messages, errors or draws.

@@ -10,8 +10,8 @@ from astropy.coordinates import SkyCoord
 
 from ..deblending.settings import FitSettings, Settings
 from ..device.workers.process_limits import free_memory
-from ..measurement.detection import THRESHOLD
-from ..sky.validation.checks import as_real_array
+from ..measurement.detection import THRESHOLD, check_threshold
+from ..sky.validation.checks import as_real_array, check_integer
 from .area import AREAS
 from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
@@ -79,6 +79,14 @@ class FieldOptions:
         _check_positions(self.positions)
         if self.passes not in (1, 2):
             raise ValueError(f"passes is {self.passes}, must be 1 or 2")
+        check_threshold(self.threshold)
+        for name, least in (("tile_px", 1), ("overlap_px", 0), ("margin_px", 0)):
+            check_integer(name, getattr(self, name), least)
+        if self.overlap_px >= self.tile_px:
+            raise ValueError(
+                f"overlap_px is {self.overlap_px}, must be below tile_px, {self.tile_px}: use for "
+                "example a tenth of it"
+            )
         if self.area not in AREAS:
             raise ValueError(f"area is {self.area!r}, must be {', '.join(map(repr, AREAS))}")
         if not 0 <= self.field_number <= LARGEST_FIELD:

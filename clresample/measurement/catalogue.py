@@ -120,6 +120,12 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
             `is_ambiguous`; -1 if there is none
     """
     check_instance("result", result, Result)
+    expected = (len(result.sources),)
+    if groups is not None and np.shape(groups) != expected:
+        raise ValueError(
+            f"groups has the shape {np.shape(groups)}, must be {expected}: give a number for each "
+            "source, as Detection.groups"
+        )
     table = catalogue_columns(result, magnitudes=magnitudes, groups=groups).table()
     describe_flags(table)
     return table

@@ -29,7 +29,7 @@ from ..drawing.display import ShownDetection
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, as_observations, check_observations
 from ..sky.sources import ExtendedSource, PointSource, Source
-from ..sky.validation.checks import check_instance
+from ..sky.validation.checks import check_instance, check_number
 from .clumps import bodies_of
 from .companions import (
     LEVEL_FWHM,
@@ -122,6 +122,11 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     if scatters is not None:
         return search(observations)
     return search_without_sky(observations, frame, search)
+
+
+def check_threshold(threshold):
+    """Raises ValueError unless a threshold [sigma] is a positive number."""
+    check_number("threshold", threshold, "a positive number of sigmas", lambda x: 0 < x < math.inf)
 
 
 def noise_scatter(observation, frame) -> np.ndarray:
@@ -262,8 +267,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
 
     places: of the frame's pixels on each observation, see `signal_of`; None = by their grids
     """
-    if not 0 < threshold < math.inf:
-        raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
+    check_threshold(threshold)
     sep = import_sep()
     at = places or [None] * len(observations)
     pairs = zip(observations, at, strict=True)

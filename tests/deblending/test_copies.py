@@ -97,7 +97,9 @@ def test_a_bad_blend_harms_no_other(device):
     good = Blend(observe(), SOURCES)
     wrong = {
         "no blend": 5,
-        "sources[1] is 'here' (str), must be Source": Blend(observe(), (SOURCES[0], "here")),
+        "sources[1] is 'here' (str), must be ExtendedSource": Blend(
+            observe(), (SOURCES[0], "here")
+        ),
         "observations[0] is None (NoneType), must be Observation": Blend((None,), SOURCES),
         "observations is empty": Blend((), SOURCES),
         "frame is 3 (int), must be Frame": Blend(observe(), SOURCES, frame=3),

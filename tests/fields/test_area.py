@@ -122,6 +122,20 @@ def test_positions_of_another_shape_are_refused(positions):
         FieldOptions(positions=positions)
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"threshold": "a"}, "threshold is 'a', must be a positive number of sigmas"),
+        ({"margin_px": "a"}, "margin_px is 'a', must be a whole number, 0 or more"),
+        ({"tile_px": -5}, "tile_px is -5, must be 1 or more"),
+        ({"tile_px": 64}, "overlap_px is 96, must be below tile_px, 64"),
+    ],
+)
+def test_numbers_of_options_are_checked(given, message):
+    with pytest.raises(ValueError, match=message):
+        FieldOptions(**given)
+
+
 def test_a_field_without_a_detection_has_a_note(tmp_path):
     found = run_field([mosaic("m", 64, 0.2)], tmp_path, options=FieldOptions(threshold=1e4))
     assert found.outputs.n_sources == 0

@@ -172,7 +172,7 @@ def test_tiles_leave_no_seams(done, sky, tmp_path):
     """Sources and their fits are in one order, however the field was searched: fits side by side
     round alike."""
     folder, _ = done
-    options = FieldOptions(tile_px=56, overlap_px=60)
+    options = FieldOptions(tile_px=64, overlap_px=60)
     run_field(mosaics_of(sky), tmp_path, options=options)
     assert len(list((tmp_path / "work").glob("tile-*.npz"))) == 25
     differences, n_others = compared(folder, tmp_path)

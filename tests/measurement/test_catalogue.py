@@ -159,6 +159,14 @@ def test_no_coverage_is_a_centre_off_an_image():
     assert flags(one_source(observations=[full, left], shifts=moved)) == [Flag(0)]
 
 
+def test_numbers_of_groups_and_draws_are_checked():
+    with pytest.raises(ValueError, match=r"groups has the shape \(2,\), must be \(1,\): give a"):
+        catalogue(one_source(), groups=[1, 2])
+    for draw in (one_source().sample, one_source().sample_fluxes):
+        with pytest.raises(ValueError, match="n is -2, must be 0 or more"):
+            draw(-2)
+
+
 def test_zero_flux_and_not_converged():
     assert flags(blend([round_component(0, MIDDLE, (1, 0))])) == [Flag.ZERO_FLUX]
     assert flags(blend([round_component(0, MIDDLE, (1, 1e-6))])) == [Flag(0)]

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 from decimal import Decimal
 
 import numpy as np
@@ -121,7 +122,7 @@ def test_angles_with_a_unit_are_converted():
 @pytest.mark.parametrize(
     "make, said",
     [
-        (lambda: PSF(IMAGE**2, spacing="a"), "spacing must be an array of real numbers"),
+        (lambda: PSF(IMAGE**2, spacing="a"), "spacing is .a., must be a positive number of pixels"),
         (lambda: PSF(IMAGE**2, spacing=1e300), "spacing is 1e.300, must be .* from 0.001 to 1000"),
         (lambda: PSF(IMAGE**2, spacing=1e-9), "spacing is 1e-09"),
         (lambda: PSF(IMAGE**2, spacing=[1, 2]), "spacing is .*positive number of pixels"),
@@ -243,3 +244,11 @@ def test_signalling_nan_is_nan():
     data = IMAGE.astype(np.float32)
     data.view(np.uint32)[0, 0] = 0x7F800001  # as flipped bits leave it
     assert observed(data).weights[0, 0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("psf", "remedy"), [("psf.fits", "read_psf(path)"), (abs, "FunctionPSF(function)")]
+)
+def test_a_psf_of_another_kind_is_refused_with_its_remedy(psf, remedy):
+    with pytest.raises(ValueError, match=re.escape(remedy)):
+        Observation(IMAGE, psf, GRID, weights=1.0)

@@ -17,7 +17,10 @@ REAL = "biuf"
 # How a user makes the objects that arguments must be, for messages.
 WAYS = {
     "Grid": "Grid.from_wcs(wcs, shape) or Grid.flat(shape, scale_arcsec)",
-    "PSF": "PSF(array)",
+    "PSF": "PSF(array) or read_psf(path)",
+    "PSFField": "FunctionPSF(function)",
+    "Source": "ExtendedSource(sky_deg=(ra, dec))",
+    "FitSettings": "Settings(max_iter=100)",
     "Observation": "Observation(data, psf, grid) or Observation.from_nddata(image, psf)",
     "Blend": "Blend(observations, sources)",
     "Result": "a result of deblend, or one of deblend_many",
@@ -26,6 +29,8 @@ WAYS = {
     "CCDData": "cutouts of Result.cutout or FieldCutouts.cutout",
     "Table": "catalogue(result)",
 }
+# Public classes in place of their base class, for messages.
+PUBLIC = {"Source": "ExtendedSource or PointSource", "FitSettings": "Settings or PaperSettings"}
 
 
 def as_float_array(name, values, unit=None) -> np.ndarray:
@@ -112,7 +117,7 @@ def split_mask(name, values):
 
 def check_number(name, value, what="a finite number", fits=math.isfinite) -> float:
     """Returns one number as a float. Raises ValueError unless `fits`, described by `what`."""
-    found = as_float_array(name, value)
+    found = as_float_array(name, np.nan if isinstance(value, str) else value)
     if found.shape != () or not fits(float(found)):
         raise ValueError(f"{name} is {plain_repr(value):.80}, must be {what}")
     return float(found)
@@ -146,8 +151,8 @@ def check_instance(name, value, kind):
     if isinstance(value, kind):
         return value
     wanted = kind if isinstance(kind, tuple) else (kind,)
-    names = [k.__name__ for k in wanted]
-    ways = [WAYS[one] for one in names if one in WAYS]
+    ways = [WAYS[k.__name__] for k in wanted if k.__name__ in WAYS]
+    names = [PUBLIC.get(k.__name__, k.__name__) for k in wanted]
     raise ValueError(
         f"{name} is {described(value)}, must be {' or '.join(names)}"
         + (f": give {' or '.join(ways)}" if ways else "")
