@@ -83,8 +83,8 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
             y, x [model px]: position as given
         flags: sum of `Flag`
-        snr: signal to noise of all B bands together, sqrt(sum_b flux_b^2 / variance_b); about
-            sqrt(B) without a source
+        snr: signal to noise of all B bands together, negative fluxes as 0,
+            sqrt(sum_b max(flux_b, 0)^2 / variance_b); about sqrt(B / 2) without a source
         n_components: number of components; two if the core has a significantly different colour,
             see `ExtendedSource`
         *_centroid: the same positions, of the fitted light

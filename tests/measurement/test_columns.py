@@ -55,6 +55,11 @@ def test_rows_are_chosen_and_become_a_table():
     [
         ("y", "row of the position in the model's pixels, from 0", u.pix),
         ("mag_err_r", "error of the magnitude in r", u.mag),
+        (
+            "colour_g_r",
+            "colour g_r: AB magnitude in its first band minus that in its second",
+            u.mag,
+        ),
         ("flux_r_err", "total flux in r_err", None),
         ("rms_size_err", "error of rms_size", u.arcsec),
         ("ra_centroid_err", "error of ra_centroid", u.deg),
