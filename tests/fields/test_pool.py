@@ -205,3 +205,11 @@ def test_an_error_has_a_cause_whatever_its_words(error, cause):
         raise error
     found = reason_of(raised.value)
     assert found.cause is cause and str(found).startswith(f"{type(error).__name__}: ")
+    is_for_users = isinstance(error, (ValueError, DeviceLostError))
+    assert (", line " in found.message) is not is_for_users
+
+
+def test_an_error_of_a_library_has_its_place():
+    with pytest.raises(ValueError) as raised:
+        int("a")
+    assert ", line " in reason_of(raised.value).message

@@ -41,11 +41,16 @@ class Reason:
 
     @classmethod
     def of(cls, error) -> Reason:
-        """The reason of an exception, with the place where it was raised."""
+        """The reason of an exception, with the place where it was raised.
+
+        A ValueError or DeviceError of a raise statement has no place: its text is for users.
+        """
         text = " ".join(str(error).split()) or "no message"
         last = traceback.extract_tb(error.__traceback__)[-1]
-        message = f"{text} ({last.name}, line {last.lineno})"
-        return cls(message, _cause(error), type(error).__name__)
+        is_for_users = isinstance(error, (ValueError, DeviceError))
+        if not (is_for_users and str(last.line).startswith("raise")):
+            text = f"{text} ({last.name}, line {last.lineno})"
+        return cls(text, _cause(error), type(error).__name__)
 
 
 def _cause(error):
