@@ -11,6 +11,8 @@ from .options import print_note
 FILES = "field.toml", "truth.ecsv"
 CLUMPS = "clumps.ecsv"  # written where a field's galaxies have clumps
 TILE = 1  # number of the tile of Euclid's MER that a simulated field becomes
+# Options by the arguments of `simulate_field` that have another name.
+OPTIONS = {"n_pixels": "--size", "rubin_bands": "--bands", "psf_variation": "--psf-variation"}
 CELL_PX = 150  # side of a cell of Rubin's coadds
 DESCRIPTION = """\
 Write a simulated field of galaxies and stars as Euclid (VIS) and Rubin see it:
@@ -62,8 +64,9 @@ def run(arguments):
             psf_variation=arguments.psf_variation,
             bad_columns=arguments.bad_columns,
         )
-    except ImportError as error:
-        raise ValueError(error) from error
+    except (ImportError, ValueError) as error:
+        name, _, rest = str(error).partition(" ")
+        raise ValueError(f"{OPTIONS.get(name, name)} {rest}") from error
     write = write_field if arguments.format == "plain" else write_surveys
     for path in write(folder, field, overwrite=arguments.overwrite):
         print(path)

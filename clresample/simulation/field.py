@@ -118,20 +118,23 @@ def _plain(surveys, grids, sources, rngs, psf_variation, bad_columns, center_deg
 
 def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands):
     """Raises ValueError for invalid arguments of `simulate_field`."""
-    for name, value, good in (
-        ("n_pixels", n_pixels, n_pixels >= 32),
-        ("density", density, density is None or density > 0),
-        ("faintest", faintest, faintest > BRIGHTEST),
-        ("clustering", clustering, 0 <= clustering <= 1),
-        ("stars", stars, stars is None or 0 <= stars <= 1),
-        ("psf_variation", psf_variation, 0 <= psf_variation < 1),
-        ("bad_columns", bad_columns, bad_columns >= 0),
+    for name, value, good, wanted in (
+        ("n_pixels", n_pixels, n_pixels >= 32, "32 or more"),
+        ("density", density, density is None or density > 0, "above 0"),
+        ("faintest", faintest, faintest > BRIGHTEST, f"above {BRIGHTEST}"),
+        ("clustering", clustering, 0 <= clustering <= 1, "from 0 to 1"),
+        ("stars", stars, stars is None or 0 <= stars <= 1, "from 0 to 1"),
+        ("psf_variation", psf_variation, 0 <= psf_variation < 1, "from 0 to below 1"),
+        ("bad_columns", bad_columns, bad_columns >= 0, "0 or more"),
     ):
         if not good:
-            raise ValueError(f"{name} is {value}, out of its range")
+            raise ValueError(f"{name} is {value}, must be {wanted}")
     unknown = [band for band in rubin_bands if band not in RUBIN_UGRIZY.bands]
     if unknown or not rubin_bands:
-        raise ValueError(f"rubin_bands is {rubin_bands}, some of {RUBIN_UGRIZY.bands} are taken")
+        raise ValueError(
+            f"rubin_bands is {','.join(rubin_bands)!r}, must be some of "
+            f"{','.join(RUBIN_UGRIZY.bands)}"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,18 @@ def test_a_disk_that_is_full_at_the_end_leaves_nothing(tmp_path, monkeypatch, ca
     assert os.listdir(tmp_path) == ["there"] and not os.listdir(tmp_path / "there")
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--size", "5"], "--size is 5, must be 32 or more"),
+        (["--bands", "q"], "--bands is 'q', must be some of u,g,r,i,z,y"),
+    ],
+)
+def test_a_value_out_of_range_is_named_by_its_option(tmp_path, capsys, words, message):
+    assert main(["simulate", "field", "-o", str(tmp_path / "new"), *words]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_other_files_are_kept_unless_asked_for(tmp_path, capsys):
     (tmp_path / "euclid.fits").write_text("precious")
     words = [*WORDS, "-o", str(tmp_path)]

@@ -14,6 +14,7 @@ from ...deblending.batch import deblend_many
 from ...deblending.blend import Blend
 from ...deblending.ended import Ended
 from ...deblending.fit import Fit, start_fits
+from ...deblending.inspection.inspect import InputWarning
 from ...deblending.iterate import iterate
 from ...deblending.settings import Settings
 from ...device.discovery import DeviceError
@@ -87,9 +88,10 @@ def blends(n, device):
 
 
 def fit(given, device, **settings):
-    """Results of blends, fitted side by side, without warnings about undetected sources."""
+    """Results of blends, fitted side by side, without warnings about sources and images."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SourceWarning)
+        for kind in (SourceWarning, InputWarning):
+            warnings.simplefilter("ignore", kind)
         results = deblend_many(given, settings=Settings(**settings), device=device, processes=1)
     for result in results:
         if result.status == Ended.FAILED:
