@@ -14,13 +14,14 @@ from ..sky.wcs import axis_names, celestial_frame
 from .execution.group_results import PATCH_COLUMNS, typed_rows
 
 
-def finalise_catalogue(job, parts, last, unsettled=()):
+def finalise_catalogue(job, parts, last, unsettled=(), names=None):
     """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
 
     parts: GroupResultsFiles; last: {patch: index of the part with its last round}
     unsettled: parents of blends that were cut into pieces which did not settle
+    names {id: name}: of listed sources, for the column `name`; None = without it
     """
-    tables, fits = [empty_catalogue(job)], []
+    tables, fits = [empty_catalogue(job, named=names is not None)], []
     for i, part in enumerate(parts):
         patches, rows = part.read("PATCHES", "CATALOGUE")
         mine = np.array([last[patch] == i for patch in patches["fit_id"].tolist()], bool)
@@ -37,6 +38,8 @@ def finalise_catalogue(job, parts, last, unsettled=()):
         for one, reason in zip(moving, rows["reason"].tolist(), strict=True)
     ]
     rows.put("reason", np.array(reasons, "U"))
+    if names is not None:
+        rows.put("name", np.array([names.get(i, "") for i in rows["id"].tolist()], "U"))
     table = rows.table()
     describe_flags(table)
     blends = Columns.concatenate(fits or [typed_rows([], PATCH_COLUMNS)])
@@ -46,7 +49,7 @@ def finalise_catalogue(job, parts, last, unsettled=()):
     return table, blends
 
 
-def empty_catalogue(job) -> Columns:
+def empty_catalogue(job, named=False) -> Columns:
     """The columns of a field's catalogue in their order, with units, without rows.
 
     They follow from the mosaics alone: a band without a single measured flux has its columns.
@@ -54,7 +57,8 @@ def empty_catalogue(job) -> Columns:
     grid = job.reference
     sky = ("y_sky", "x_sky") if grid.is_flat else axis_names(grid.wcs)
     places = (*sky, "y", "x")
-    names = ["id", "parent_id", "group_id", *places, "flags", "status", "reason"]
+    names = ["id", *(["name"] if named else []), "parent_id", "group_id", *places]
+    names += ["flags", "status", "reason"]
     names += ["n_blend_sources", "n_group", "detection_pass", "detection_snr", "snr"]
     names += ["n_components", *(f"{name}_centroid{end}" for end in ("", "_err") for name in places)]
     names += [f"{name}{end}" for name in SHAPES for end in ("", "_err")]

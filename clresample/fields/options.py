@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ class FieldOptions:
         residuals too
     positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of known
         sources, or a SkyCoord of S positions; None = detect sources
+    names (S,): of these sources, for the catalogue's column `name`; None = it has none
     area: sky whose sources are in the catalogue: "all", that of all mosaics; "finest", that of the
         mosaic with the smallest pixels; "auto", the first unless it has over MAX_GROWTH times as
         many model pixels. Beyond "finest", `margin_px` are searched and fitted too
@@ -60,6 +62,7 @@ class FieldOptions:
     threshold: float = THRESHOLD
     passes: int = 2
     positions: np.ndarray | None = None
+    names: Sequence[str] | None = None
     area: str = "auto"
     part: tuple[int, int] | None = None
     margin_px: int = 256
@@ -76,7 +79,11 @@ class FieldOptions:
     field_number: int = 0
 
     def __post_init__(self):
-        _check_positions(self.positions)
+        n = _n_positions(self.positions)
+        if self.names is not None and len(self.names) != n:
+            raise ValueError(
+                f"names has {len(self.names)} names, must have one for each of {n} positions"
+            )
         if self.passes not in (1, 2):
             raise ValueError(f"passes is {self.passes}, must be 1 or 2")
         check_threshold(self.threshold)
@@ -124,17 +131,18 @@ class FieldOptions:
         return replace(self, group_memory=memory, limits=replace(self.limits, max_bytes=max_bytes))
 
 
-def _check_positions(positions):
-    """Raises ValueError unless positions are None, a SkyCoord or an array, of one or more."""
+def _n_positions(positions) -> int:
+    """The number of positions, 0 of None. Raises ValueError for an empty or misshapen array."""
     is_coord = isinstance(positions, SkyCoord)
     if positions is None or (is_coord and positions.size):
-        return
+        return 0 if positions is None else positions.size
     shape = positions.shape if is_coord else as_real_array("positions", positions).shape
     if len(shape) != 2 or shape[1] != 2 or shape[0] == 0:
         raise ValueError(
             f"positions has the shape {shape}, must be (S, 2) with at least one source: give None "
             "to detect sources"
         )
+    return shape[0]
 
 
 @dataclass(eq=False)

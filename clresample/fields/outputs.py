@@ -65,7 +65,7 @@ def check_outputs(folder, mosaics):
 
 
 def write_outputs(
-    folder, job, parts, unsettled, about, seconds, hats=False, notes=()
+    folder, job, parts, unsettled, about, seconds, hats=False, notes=(), names=None
 ) -> FieldOutputs:
     """Writes all outputs of a field together or none; the folder of HATS before them.
 
@@ -73,12 +73,13 @@ def write_outputs(
     unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
     hats: write the catalogue in the HATS layout too, if it has rows; notes: of the run so far
+    names {id: name}: of listed sources, None = the catalogue has no column of them
 
     catalogue.{parquet,fits,ecsv} are identical for repeated runs of the same field: times are in
     fit_table.ecsv and provenance.json. Raises FileError.
     """
     last = last_rounds([part.read("PATCHES")[0] for part in parts])
-    table, blends = finalise_catalogue(job, parts, last, unsettled)
+    table, blends = finalise_catalogue(job, parts, last, unsettled, names)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
     notes = [*notes, *([] if find_spec("pyarrow") else [NO_PARQUET])]
     notes += [*_unmeasured(job, table, blends), *_noted_messages(job, blends)]

@@ -98,6 +98,7 @@ def run_field(
         plan = load_or_make_plan(
             mosaics, reference, region, core, work, options, engine, progress, clock
         )
+        names = _names_by_id(plan, options.names, known, region)
         job = FieldJob(
             mosaics=mosaics,
             reference=reference,
@@ -117,7 +118,7 @@ def run_field(
         clock.stop("fit")
         progress.stage("write", 1)
         outputs = write_outputs(
-            folder, job, parts, unsettled, about or {}, seconds, options.hats, notes
+            folder, job, parts, unsettled, about or {}, seconds, options.hats, notes, names
         )
     finally:
         engine.close()
@@ -125,6 +126,18 @@ def run_field(
     clock.stop("write")
     failed = outputs.status.get(Ended.FAILED, 0)
     return FieldRun(outputs, seconds, failed, plan.failed_tiles, tuple(engine.turns))
+
+
+def _names_by_id(plan, names, positions, region):
+    """Names {id: name} of the listed sources at positions (S, 2) [model px]; None without names.
+
+    A plan has those in its region, in the order of their positions.
+    """
+    if names is None:
+        return None
+    inside = np.flatnonzero(region.contains(positions))
+    order = inside[np.lexsort(positions[inside].T[::-1])]
+    return dict(zip(plan.ids.tolist(), (str(names[i]) for i in order.tolist()), strict=True))
 
 
 def _degrees(positions, reference):

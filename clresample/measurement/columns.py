@@ -33,7 +33,7 @@ def definitions(given) -> dict[str, ColumnDefinition]:
 # Columns by name, of a blend's catalogue and of a field's.
 DEFINITIONS = definitions(
     {
-        "name": ("of the source: its own, or its number", None, "U"),
+        "name": ("of the source: its own, or its number; in a field that of the list", None, "U"),
         "id": ("of the source: field, row, column of the model's pixel at it", None, np.int64),
         "parent_id": ("id of the brightest source detected in the same blend", None, np.int64),
         "group_id": ("id of the brightest source of its group, or its own", None, np.int64),

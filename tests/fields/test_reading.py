@@ -226,6 +226,14 @@ def test_options_of_the_file(files):
     assert options.settings.psf_tolerance == 0.01 and options.settings.fit_shifts
 
 
+def test_names_of_a_list_are_those_of_its_positions(files):
+    listed = 'variance = "var.fits"', '[sources]\ncatalogue = "list.csv"\n'
+    for rows, names in (("name,ra,dec\nb,10,-30\n", ["b"]), ("ra,dec\n10,-30\n", None)):
+        (files / "list.csv").write_text(rows)
+        options = field_of(files, *listed).options
+        assert options.names == names and options.positions.tolist() == [[10, -30]]
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

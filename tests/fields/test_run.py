@@ -268,10 +268,16 @@ def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, t
 def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
     folder, _ = done
     rows = table(folder)
-    options = FieldOptions(positions=SkyCoord(rows["ra"], rows["dec"]), passes=1)
+    shuffled = np.random.default_rng(0).permutation(len(rows))
+    listed = SkyCoord(rows["ra"], rows["dec"])[[*shuffled, 0]]  # the last one is there twice
+    names = [*(f"no {i}" for i in shuffled), "again"]
+    options = FieldOptions(positions=listed, names=names, passes=1)
     run_field(mosaics_of(sky), tmp_path, options=options)
     known = table(tmp_path)
-    np.testing.assert_array_equal(known["id"], rows["id"])
+    again = np.array(known["name"] == "again")
+    np.testing.assert_array_equal(known["id"][~again], rows["id"])
+    assert known["name"][~again].tolist() == [f"no {i}" for i in range(len(rows))]
+    assert known.colnames[:2] == ["id", "name"] and np.isin(known["id"][again] - 1, rows["id"])
     assert set(known["detection_pass"]) == {1}
 
 
@@ -281,6 +287,7 @@ def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
         ({"passes": 3}, "passes is 3"),
         ({"field_number": -1}, "field_number is -1"),
         ({"group_memory": 1000}, "group_memory is 1000 bytes"),
+        ({"names": ["a"]}, "names has 1 names, must have one for each of 0 positions"),
         ({"workers": -1}, "workers is -1"),
         ({"area": "VIS"}, "area is 'VIS', must be 'auto', 'all', 'finest'"),
     ],

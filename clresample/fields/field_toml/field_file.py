@@ -74,6 +74,8 @@ def _options(path, tables, inputs):
         if any(s.sky_deg is None for s in sources):
             raise SceneError(f"{path}: sources: a field's are placed by ra and dec")
         given["positions"] = np.array([s.sky_deg for s in sources])
+        if any(s.name for s in sources):
+            given["names"] = [s.name or "" for s in sources]
     limits = replace(limits, **{k: about[k] for k in ("max_sources", "max_pixels") if k in about})
     try:
         settings = Settings(**tables["fit"])
