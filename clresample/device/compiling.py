@@ -9,7 +9,7 @@ import time
 from contextlib import contextmanager, suppress
 
 from ..drawing.bar import is_watched, passing_bar
-from .discovery import n_host_cores
+from .host import n_host_cores
 
 # [s] Processor time of a build: 0.02 from PoCL's or pyopencl's cache, 0.08 and more from source.
 MAX_CACHED_S = 0.04

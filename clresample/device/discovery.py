@@ -98,12 +98,6 @@ def format_size(n_bytes):
     return f"{n_bytes} B"
 
 
-def n_host_cores():
-    """Number of cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def choose(choice):
     """The pyopencl device for a choice in the forms of `get_device`."""
     found = find_devices()

@@ -27,12 +27,12 @@ from .discovery import (
     find_devices,
     is_simulated,
     kind_of,
-    n_host_cores,
 )
+from .host import free_memory, n_host_cores
 from .workers.crew import TaskQueue
 from .workers.outcome import Cause, Reason
 from .workers.pool import WorkerPool
-from .workers.process_limits import free_memory, thread_environment
+from .workers.process_limits import thread_environment
 
 # Items of a device's first portion, before its speed is known.
 FIRST_BATCH = 4

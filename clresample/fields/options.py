@@ -10,7 +10,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from ..deblending.settings import FitSettings, Settings
-from ..device.workers.process_limits import free_memory
+from ..device.host import free_memory
 from ..measurement.detection import THRESHOLD, check_threshold
 from ..sky.validation.checks import as_real_array, check_integer
 from .area import AREAS

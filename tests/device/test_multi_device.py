@@ -13,7 +13,7 @@ from clresample import Blend, DeviceError, deblend, deblend_many
 from clresample.deblending import batch
 from clresample.device import multi_device
 from clresample.device.device_cache import DeviceWarning
-from clresample.device.discovery import n_host_cores
+from clresample.device.host import n_host_cores
 from clresample.device.multi_device import (
     _DevicePool,
     _Portions,

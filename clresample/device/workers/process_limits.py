@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 
-from ..discovery import n_host_cores
+from ..host import n_host_cores
 
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 
@@ -41,18 +41,6 @@ def limit_memory(bound):
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     if most == resource.RLIM_INFINITY or bound < most:
         resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))
-
-
-def free_memory() -> int:
-    """Free memory [bytes] of this machine, with what its caches would give up; 2 GiB if unknown."""
-    with contextlib.suppress(OSError, StopIteration, ValueError, IndexError):  # Linux
-        with open("/proc/meminfo", encoding="ascii") as lines:
-            line = next(line for line in lines if line.startswith("MemAvailable:"))
-        return int(line.split()[1]) * 1024
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return 2 << 30
 
 
 def trim_memory():
