@@ -166,10 +166,10 @@ def deblend_many(
 def _fit_on_one(blends, device, processes, progress, given):
     """Results of `_fit_all`, by several processes if that is quicker; see `deblend_many`."""
     if processes is None:
-        n = n_processes(blends, device)
+        n = n_processes(blends, device, given["settings"])
     else:
         n = check_integer("processes", processes, least=1)
-        n = n if n == 1 or can_be_sent(blends) else 1
+        n = n if n == 1 or can_be_sent((blends, given["settings"])) else 1
     if n > 1:
         fit_some = functools.partial(_fit_all, **given)
         most = min(MAX_BLENDS, -(-len(blends) // n))

@@ -1,8 +1,8 @@
 """Processes that share the cores of a CPU between the blends of one call.
 
 Most of a fit's time is Python's, of which a process runs one thread at a time, and launches on the
-small images of a blend gain little from further cores. A process for each core gains nearly the
-number of cores.
+small images of a blend gain little from further cores. On two cores two processes take 0.66 of the
+time of one for 128 joint scenes, their start included, and 0.73 for 32.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ MIN_SOURCES = 50
 MAX_BLENDS = 32
 
 
-def n_processes(blends, device) -> int:
+def n_processes(blends, device, settings) -> int:
     """Number of processes that fit blends on a device in the shortest time; 1 = the present one.
 
     That is 1 for GPUs, for few sources, in a process that another one has started by
-    `multiprocessing`, and for blends that need the caller's script (PSFs by functions of it).
+    `multiprocessing`, and for blends or FitSettings that need the caller's script (PSFs by
+    functions of it, constraints by its classes).
     """
     n = min(len(blends), _n_sources(blends) // MIN_SOURCES)
     if n < 2 or multiprocessing.parent_process() is not None:
         return 1
     n = min(n, n_beside(device.cl))
-    return n if n > 1 and can_be_sent(blends) else 1
+    return n if n > 1 and can_be_sent((blends, settings)) else 1
 
 
-def can_be_sent(blends) -> bool:
-    """True if another process can read blends without the caller's script."""
+def can_be_sent(objects) -> bool:
+    """True if another process can read objects without the caller's script."""
     written = io.BytesIO()
     try:
-        _WithoutArrays(written).dump(blends)
+        _WithoutArrays(written).dump(objects)
     except Exception:  # whatever an object of the caller's raises
         return False
     return b"__main__" not in written.getvalue()

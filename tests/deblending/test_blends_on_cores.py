@@ -49,12 +49,12 @@ def many(monkeypatch):
 def test_each_process_gets_enough_sources(device, many, n, expected):
     """Of blends of three sources."""
     (blend,) = blends(1, device)
-    assert processes.n_processes([blend] * n, device) == expected
+    assert processes.n_processes([blend] * n, device, SETTINGS) == expected
 
 
 def test_one_process_in_those_of_multiprocessing(device, many, monkeypatch):
     monkeypatch.setattr(processes.multiprocessing, "parent_process", lambda: object())
-    assert processes.n_processes(blends(1, device) * 100, device) == 1
+    assert processes.n_processes(blends(1, device) * 100, device, SETTINGS) == 1
 
 
 def psf_of_a_script(y, x):
@@ -71,7 +71,8 @@ def test_blends_that_need_the_script_stay_in_its_process(device, many, function,
     monkeypatch.setattr(sys.modules["__main__"], "psf_of_a_script", function, raising=False)
     wrong = replace(blend, observations=(FunctionPSF(function),))
     assert not processes.can_be_sent([blend, wrong])
-    assert processes.n_processes([wrong] * 100, device) == 1
+    assert processes.n_processes([wrong] * 100, device, SETTINGS) == 1
+    assert processes.n_processes([blend] * 100, device, function) == 1
 
 
 def test_fits_go_on_here_if_no_process_does(device, monkeypatch):
