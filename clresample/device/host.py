@@ -1,4 +1,4 @@
-"""What this process may use of its machine: cores and memory.
+"""Cores and memory that this process may use of its machine.
 
 In containers and batch jobs that is often less than the machine has, by the limits of their control
 groups (Linux, versions 1 and 2).
