@@ -133,10 +133,10 @@ class FieldOptions:
 
 def _n_positions(positions) -> int:
     """The number of positions, 0 of None. Raises ValueError for an empty or misshapen array."""
+    if positions is None:
+        return 0
     is_coord = isinstance(positions, SkyCoord)
-    if positions is None or (is_coord and positions.size):
-        return 0 if positions is None else positions.size
-    shape = positions.shape if is_coord else as_real_array("positions", positions).shape
+    shape = (positions.size, 2) if is_coord else as_real_array("positions", positions).shape
     if len(shape) != 2 or shape[1] != 2 or shape[0] == 0:
         raise ValueError(
             f"positions has the shape {shape}, must be (S, 2) with at least one source: give None "

@@ -98,7 +98,7 @@ def run_field(
         plan = load_or_make_plan(
             mosaics, reference, region, core, work, options, engine, progress, clock
         )
-        names = _names_by_id(plan, options.names, known, region)
+        names = _names_by_id(plan, options.names, known)
         job = FieldJob(
             mosaics=mosaics,
             reference=reference,
@@ -128,16 +128,18 @@ def run_field(
     return FieldRun(outputs, seconds, failed, plan.failed_tiles, tuple(engine.turns))
 
 
-def _names_by_id(plan, names, positions, region):
+def _names_by_id(plan, names, positions):
     """Names {id: name} of the listed sources at positions (S, 2) [model px]; None without names.
 
-    A plan has those in its region, in the order of their positions.
+    A plan has those in its region, without those of tiles that failed, in another order.
     """
     if names is None:
         return None
-    inside = np.flatnonzero(region.contains(positions))
-    order = inside[np.lexsort(positions[inside].T[::-1])]
-    return dict(zip(plan.ids.tolist(), (str(names[i]) for i in order.tolist()), strict=True))
+    names_at: dict[tuple, list[str]] = {}
+    for place, name in zip(positions.tolist(), names, strict=True):
+        names_at.setdefault(tuple(place), []).append(str(name))
+    pairs = zip(plan.ids.tolist(), plan.positions.tolist(), strict=True)
+    return {one: names_at[tuple(place)].pop(0) for one, place in pairs}
 
 
 def _degrees(positions, reference):

@@ -188,25 +188,24 @@ def masked(observation, pixels) -> Observation:
 
 def with_weights(observation, weights) -> Observation:
     """The same observation with these weights (C, Ny, Nx) [counts^-2]."""
-    made = copy.copy(observation)
-    made.__dict__.pop("whitened", None)  # cached for the other weights
-    made._set(weights=weights)
-    return made
+    return _changed(observation, weights=weights)
 
 
 def with_data(observation, data) -> Observation:
     """The same observation with these data (C, Ny, Nx) [counts]."""
-    made = copy.copy(observation)
-    made.__dict__.pop("whitened", None)  # cached for the other data
-    made._set(data=data)
-    return made
+    return _changed(observation, data=data)
 
 
 def with_psf_field(observation, psf_field) -> Observation:
     """The same observation with the PSFs of a PSFField; its PSF in the middle stays."""
+    return _changed(observation, psf_field=psf_field)
+
+
+def _changed(observation, **values):
+    """A copy with other fields, without what is cached for the old ones."""
     made = copy.copy(observation)
     made.__dict__.pop("whitened", None)
-    made._set(psf_field=psf_field)
+    made._set(**values)
     return made
 
 

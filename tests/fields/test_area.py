@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from clresample.fields.area import field_area
 from clresample.fields.blends.plan import source_ids
 from clresample.fields.blends.search import snr_scatter
 from clresample.fields.reference import reference_grid
+from clresample.fields.run import _names_by_id
 from clresample.sky.box import Box
 
 PSF = np.outer(*[np.exp(-(np.linspace(-2, 2, 9) ** 2))] * 2)
@@ -140,3 +142,11 @@ def test_a_field_without_a_detection_has_a_note(tmp_path):
     found = run_field([mosaic("m", 64, 0.2)], tmp_path, options=FieldOptions(threshold=1e4))
     assert found.outputs.n_sources == 0
     assert "no source was detected over 10000 sigma, and the catalogue" in found.outputs.notes[0]
+
+
+def test_names_are_those_at_the_places_of_a_plan_that_lacks_some():
+    """Of a tile that failed; two at one place keep their order."""
+    listed = np.array([[5.0, 1.0], [2.0, 3.0], [5.0, 1.0], [9.0, 9.0]])
+    plan = SimpleNamespace(ids=np.array([7, 8, 9]), positions=listed[[1, 0, 2]])
+    assert _names_by_id(plan, list("abcd"), listed) == {7: "b", 8: "a", 9: "c"}
+    assert _names_by_id(plan, None, None) is None

@@ -95,10 +95,7 @@ class Posterior:
             which channels are weighted for moments
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
-        slopes, flux = self.flux_slopes, np.zeros((n_sources, self.layout.n_channels))
-        totals = np.array([sums[0, 0] for sums in self._sums])
-        np.add.at(flux, owner, self.solution.spectra * totals[:, None])
-        n_channels = len(unit)
+        slopes, n_channels = self.flux_slopes, len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
         colour = np.zeros((n_sources, n_channels, n_channels))
         for (i, j), block in self.covariance.items():
@@ -112,7 +109,7 @@ class Posterior:
             if s == t:
                 found = part @ slopes[j].T
                 colour[s] += found if i == j else found + found.T
-        released = np.zeros(flux.shape)
+        released = np.zeros((n_sources, n_channels))
         for s, slope, change in zip(owner, slopes, self.released, strict=False):
             released[s] += slope @ change
         released = within_errors(released.T, between).T
