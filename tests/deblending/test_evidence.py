@@ -62,6 +62,31 @@ def test_determined_parameters_are_their_definition(evidence):
     assert evidence.determined(strengths, SPECTRUM) == pytest.approx(wanted, rel=0.02)
 
 
+@pytest.mark.parametrize("strength", [0.01, 0.03, 0.3])
+@pytest.mark.parametrize("scale", [0, 1])
+def test_first_strengths_are_those_that_slopes_were_drawn_with(scale, strength):
+    """Slopes H z + noise of covariance H, of structure at one scale, that all pixels show.
+
+    The mean power of many, as a source of this size has few independent coefficients of 4 px.
+    """
+    prior = MultiscalePrior(scales_px=(1.0, 4.0), strengths=(0.1, 0.1), hyperprior_weight=1e-3)
+    spectra, profile, rng = LocalPowerSpectra(prior), disk(40, 12.0), np.random.default_rng(7)
+    root, flux = prior.amplitude(profile).ravel(), 3000.0
+    u = [root[:, None] * np.kron(*axes) for axes in Source(profile, prior).axes]
+    z, noise = rng.normal(size=(100, u[scale].shape[1])), rng.normal(size=(100, profile.size))
+    residuals = flux * strength * z @ u[scale].T + noise
+    powers = np.array([np.square(flux * residuals @ part).sum() / 100 for part in u])
+    source = SourceEvidence(spectra, prior, profile, np.ones((1, spectra.weight.size)))
+    found = source.first_strengths(powers, [flux])
+    assert found[scale] == pytest.approx(strength, rel=0.15)
+    assert found[1 - scale] < 0.5 * strength
+
+
+def test_sources_that_determine_little_begin_with_the_priors_strengths(evidence):
+    powers = np.full(3, 1e6)
+    np.testing.assert_array_equal(evidence.first_strengths(powers, [0.1, 0]), PRIOR.strengths)
+
+
 def test_determined_parameters_count_those_of_the_posterior():
     """trace(H (H + alpha^-2)^-1) of one scale on a flat profile, seen in every pixel."""
     prior = MultiscalePrior(scales_px=(1.0,), strengths=(0.1,))

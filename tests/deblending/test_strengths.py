@@ -12,6 +12,7 @@ from helpers.solver import ragged
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.buffers import ITEMS_EACH, SceneBuffers
 from clresample.deblending.solver.gradient import LossGradient
+from clresample.deblending.solver.multiscale import evidence
 from clresample.deblending.solver.multiscale.evidence import (
     LocalPowerSpectra,
     SourceEvidence,
@@ -155,6 +156,21 @@ def test_scenes_that_are_due_learn_from_their_own_energies_and_misfit(build):
     np.testing.assert_allclose(moved, [largest[m.scene == b].max() for b in range(3)], rtol=1e-6)
     loss = 0.5 * (energies * (wanted**-2 - old**-2)).sum(1)
     np.testing.assert_allclose(change, [loss[m.scene == b].sum() for b in range(3)], rtol=1e-5)
+
+
+def test_scenes_that_begin_take_their_strengths_from_their_own_slopes(build, monkeypatch):
+    monkeypatch.setattr(evidence, "MIN_DETERMINED", 0.0)  # these boxes have few pixels
+    m = Learning(build)
+    powers = np.random.default_rng(2).uniform(0, 1e9, (9, 3))
+    spectra, begin = 1e3 * m.spectra, np.array([True, False, True])
+    old = m.strengths.values.copy()
+    m.strengths.begin(begin, powers, spectra)
+    wanted = old.copy()
+    for i in np.flatnonzero(begin[m.scene] & ~m.fixed):
+        wanted[i] = m.evidence[i].first_strengths(powers[i], spectra[i])
+    assert (wanted != old).any(1).tolist() == (begin[m.scene] & ~m.fixed).tolist()
+    np.testing.assert_allclose(m.strengths.values, wanted, rtol=1e-6)
+    np.testing.assert_allclose(build.get(m.strengths.precision), wanted**-2, rtol=1e-6)
 
 
 def test_clear_structure_is_looked_for_in_scenes_that_ask_and_learned_from_then_on(build):

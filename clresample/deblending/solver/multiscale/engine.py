@@ -62,6 +62,8 @@ class MultiscaleEngine:
             v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
             spectra = np.concatenate([s.spectra for s in states])
+            if any(s.learned is None for s in states):
+                self.strengths.begin([s.learned is None for s in states], *self._slope_powers())
             self.strengths.request_blocks(spectra, self.progress.n_rounds)
             self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
             self._exchanges = [[] for _ in scenes]
@@ -140,6 +142,15 @@ class MultiscaleEngine:
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
         v.pack_gradients(gradient.rows_pull, self._row0)
         self.steps.queue_products()
+
+    def _slope_powers(self):
+        """|dL/dz|^2 (S, J) at the trials, without structure, and the spectra (S, C) there."""
+        v = self.vectors
+        self.structure.form(v.x_new)
+        v.unpack_spectra(v.x_new)
+        self._gradient.queue()
+        self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
+        return self._energies(v.g_new)
 
     def _clear(self, asking):
         """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""

@@ -138,6 +138,17 @@ class PriorStrengths:
             found[self._scene[s]] |= self.significant[s]
         return found
 
+    def begin(self, which, powers, spectra):
+        """First strengths of the scenes `which` (B,), see `SourceEvidence.first_strengths`.
+
+        powers (S, J): |dL/dz|^2 without structure; spectra (S, C)
+        """
+        for s in self._free_of(np.array(which)):
+            self.values[s] = self._evidence[s].first_strengths(powers[s], spectra[s])
+        self.buffers.device.upload(
+            np.ascontiguousarray(self.values**-2, self.buffers.dtype), self.precision
+        )
+
     def learn(self, due, energies, spectra):
         """New strengths of the scenes `due` (B,), from the residuals in the image buffers.
 
