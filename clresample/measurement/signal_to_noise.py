@@ -25,9 +25,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..deblending.inspection.image import SIGMAS_A_FWHM
 from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
+from ..sky.psf import SIGMAS_A_FWHM
 from .levels import deficit_of, level_of
 
 # [arcsec] Standard deviations of G: for points, for galaxies of typical size in deep images (half

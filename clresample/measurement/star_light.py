@@ -27,10 +27,11 @@ from scipy.ndimage import (
     median_filter,
 )
 
-from ..deblending.inspection.image import SIGMAS_A_FWHM, brightness, typical_sigma
+from ..deblending.inspection.image import brightness, typical_sigma
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
 from ..deblending.inspection.star_profile import RadialProfile
+from ..sky.psf import SIGMAS_A_FWHM
 from .signal_to_noise import WIDTHS_ARCSEC, SignalToNoise
 
 # [FWHM of the filtered image] Length L: a source is narrower along every ray.

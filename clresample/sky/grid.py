@@ -26,6 +26,7 @@ from .wcs import (
     celestial_wcs,
     convert,
     cutout_wcs,
+    finer_wcs,
     pixel_scale,
     pixel_to_world,
     tangent_wcs,
@@ -140,6 +141,14 @@ class Grid(GridDisplay, ABC):
         """Grid of the `shape` (Ny, Nx) pixels from (y0, x0) on; they may lie outside this one."""
 
     @abstractmethod
+    def finer(self, factor) -> Grid:
+        """Grid of the same sky on pixels with sides 1 / factor, a whole number, as long.
+
+        Distortions are left out, except those of the projection: the same sky then lies off by as
+        much.
+        """
+
+    @abstractmethod
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0) -> WCS:
         """The WCS; for a flat grid a gnomonic one (ICRS) that touches the sky at (y, x) = (0, 0).
 
@@ -237,6 +246,11 @@ class FlatGrid(Grid):
             check_image_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0)
         )
 
+    def finer(self, factor):
+        """The Jacobian over the factor, with the outer edges of these pixels."""
+        origin = self.origin + self.jacobian @ np.full(2, (1 / factor - 1) / 2)
+        return FlatGrid(_times(self.shape, factor), self.jacobian / factor, origin)
+
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A gnomonic WCS (ICRS) that touches the flat sky at (y, x) = (0, 0)."""
         return tangent_wcs(self.jacobian, self.origin, ra_deg, dec_deg)
@@ -295,6 +309,10 @@ class WcsGrid(Grid):
         """The same WCS with its reference pixel, and those of its distortions, moved."""
         return WcsGrid(check_image_shape(shape), cutout_wcs(self.wcs, y0, x0))
 
+    def finer(self, factor):
+        """The WCS with smaller pixels, without SIP and tables of distortion."""
+        return WcsGrid(_times(self.shape, factor), finer_wcs(self.to_wcs(), factor))
+
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A copy of the WCS, of an Ape14Wcs its FITS approximation."""
         if isinstance(self.wcs, Ape14Wcs):
@@ -331,6 +349,11 @@ def as_grid(name, grid, shape=None) -> Grid:
     if shape is None or len(shape) < 2:
         raise ValueError(f"{name} is a WCS without a shape: give Grid.from_wcs(wcs, shape)")
     return Grid.from_wcs(grid, shape)
+
+
+def _times(shape, factor):
+    """A shape (2,) on pixels `factor` times finer."""
+    return tuple(factor * n for n in shape)
 
 
 def _cos_sin(angle_deg):

@@ -20,6 +20,7 @@ BAND_SLACK = 1e-12
 # [px] Largest distance of two samples, and the inverse of the smallest: others are errors of unit.
 COARSEST = 1e3
 SPACINGS = f"a positive number of pixels, from {1 / COARSEST:g} to {COARSEST:g}"
+SIGMAS_A_FWHM = math.sqrt(8 * math.log(2))  # of a Gaussian
 # [samples] Largest distance of a centre from the middle of the array: others are errors of unit.
 FAR = 1e3
 # [complex numbers] One block of the general transform's tables: 16 MiB, about the size of the

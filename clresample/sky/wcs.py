@@ -206,3 +206,17 @@ def cutout_wcs(wcs, y0, x0):
             setattr(wcs, name, moved)
     wcs.wcs.set()
     return wcs
+
+
+def finer_wcs(wcs, factor):
+    """An astropy WCS of pixels with sides 1 / factor as long, without SIP and distortion tables."""
+    wcs = wcs.deepcopy()
+    wcs.sip = wcs.cpdis1 = wcs.cpdis2 = wcs.det2im1 = wcs.det2im2 = None
+    wcs.wcs.ctype = [name.removesuffix("-SIP") for name in wcs.wcs.ctype]
+    wcs.wcs.crpix = (wcs.wcs.crpix - 0.5) * factor + 0.5
+    if wcs.wcs.has_cd():
+        wcs.wcs.cd = wcs.wcs.cd / factor
+    else:
+        wcs.wcs.cdelt = wcs.wcs.cdelt / factor
+    wcs.wcs.set()
+    return wcs

@@ -48,6 +48,49 @@ def test_of_equal_pixels_the_first_are_taken():
         on_pixels_of(frame, first)
 
 
+NARROW = PSF.gaussian(0.6, n_pixels=17)
+
+
+def placed(kind, center, angle=0.0):
+    """A grid of 0.3 arcsec on a flat or on the curved sky; center (2,) [px]."""
+    if kind == "flat":
+        y, x = center
+        return Grid.flat((20, 24), 0.3, angle_deg=angle, center_arcsec=(0.3 * y, 0.3 * x))
+    y, x = center
+    return grid_of(
+        header((20, 24), scale=0.3 / 3600, CROTA2=angle, CRPIX1=12.5 - x, CRPIX2=10.5 - y), (20, 24)
+    )
+
+
+@pytest.mark.parametrize("kind", ["flat", "celestial"])
+@pytest.mark.parametrize(
+    "center, angle, psf, is_finer",
+    [
+        ((0.5, 0.0), 0.0, NARROW, True),
+        ((0.0, 0.0), 40.0, NARROW, True),
+        ((1.0, -2.0), 0.0, NARROW, False),  # the same pixels
+        ((0.0, 0.5), 0.0, PSF_OUT, False),
+    ],
+)
+def test_dithered_images_of_a_narrow_psf_have_finer_model_pixels(
+    kind, center, angle, psf, is_finer
+):
+    """Together they show more than the pixels of one."""
+    first = Observation(np.zeros((20, 24)), psf, placed(kind, (0, 0)), weights=1, name="A")
+    grid = placed(kind, center, angle)
+    other = Observation(np.zeros(grid.shape), psf, grid, weights=1, name="B")
+    frame = model_frame([first, other])
+    scale = 0.15 if is_finer else 0.3
+    assert frame.grid.pixel_scale_arcsec == pytest.approx(scale, rel=1e-6)
+    for one in (first, other):
+        assert one.grid.map_to(frame.grid).covered.all()
+    mapping = first.grid.map_to(frame.grid)
+    np.testing.assert_allclose(mapping.matrix, np.eye(2) * (2 if is_finer else 1), atol=1e-6)
+    # their outer edges meet
+    assert mapping.offset - np.floor(mapping.offset) == pytest.approx(0.5 * is_finer, abs=1e-5)
+    assert model_frame([first]).grid.pixel_scale_arcsec == pytest.approx(0.3, rel=1e-6)
+
+
 def test_union_and_what_is_shared():
     one = observe(Grid.flat((10, 12), 0.1), "A")
     other = observe(Grid.flat((10, 12), 0.1, center_arcsec=(0.3, -0.5)), "B")

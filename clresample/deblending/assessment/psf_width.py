@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...sky.psf import SIGMAS_A_FWHM
 from ..component_images import image_within, window_of
-from ..inspection.image import SIGMAS_A_FWHM
 from ..posterior.residuals import MISFIT_SIGMAS
 
 

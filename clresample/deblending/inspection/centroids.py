@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .image import SIGMAS_A_FWHM, InspectedImage
+from ...sky.psf import SIGMAS_A_FWHM
+from .image import InspectedImage
 
 # [sigma] Sources this bright in a channel have a centroid to a tenth of the PSF's width.
 BRIGHT_SIGMAS = 20.0

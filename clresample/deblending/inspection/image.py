@@ -9,6 +9,7 @@ import numpy as np
 
 from ...sky.box import Box
 from ...sky.observation import Observation, masked
+from ...sky.psf import SIGMAS_A_FWHM
 
 # [pixels] Number of weights, evenly spread over the image, whose median gives the noise of a
 # channel. Its error is a few percent of the scatter of weights, which suffices for thresholds.
@@ -17,7 +18,6 @@ N_WEIGHTS = 1000
 LATTICE = np.array([(y, x) for y in (0.0, 0.5, 1.0) for x in (0.0, 0.5, 1.0)])
 # Largest number of sources measured in an image, the brightest: more would only cost time.
 MAX_SOURCES = 12
-SIGMAS_A_FWHM = 2.3548  # of a Gaussian
 # Relative size below which an element of a matrix fitted to the lattice is a rounding error.
 ROUNDING = 1e-9
 

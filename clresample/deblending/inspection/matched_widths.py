@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import laplace
 
+from ...sky.psf import SIGMAS_A_FWHM
 from .disagreement import ImagePlane, Matched
-from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
 from .shifted import channels_of_light, sharpest
 

@@ -28,10 +28,9 @@ from scipy.ndimage import (
 )
 
 from ...sky.observation import with_psf_field
-from ...sky.psf import PSF
+from ...sky.psf import PSF, SIGMAS_A_FWHM
 from ...sky.sources import ExtendedSource, PointSource
 from ...sky.varying_psf.field import PSFField
-from .image import SIGMAS_A_FWHM
 from .psf_samples import inscribed_radius, psf_at, ring_mean
 from .spoilt import GROW_PX
 from .star_cores import star_cores

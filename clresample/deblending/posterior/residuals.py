@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
+from ...sky.psf import SIGMAS_A_FWHM
 from ..component_images import image_within, joint_window
 from ..solver.multiscale.prior import gaussian
 
@@ -189,7 +190,7 @@ def _kernels(psf):
     """Images of the PSF on the observation's pixels; of an oversampled one, Gaussians as wide."""
     if psf.spacing == 1:
         return psf.images
-    sigma_px = psf.fwhm_px / np.sqrt(8 * np.log(2))
+    sigma_px = psf.fwhm_px / SIGMAS_A_FWHM
     sides = [gaussian(sigma, KERNEL_PX, unit_sum=True) for sigma in sigma_px]
     return np.array([np.outer(side, side) for side in sides])
 
