@@ -31,6 +31,38 @@ def test_a_variance_of_the_datas_own_counts_is_smoothed_and_fluxes_are_right(sky
     assert error == pytest.approx(exact, rel=0.2)
 
 
+@pytest.mark.parametrize("sky", [0.1, 0.5, 2.0])
+def test_counts_of_0_have_a_variance_too(sky):
+    """Without a weight, as their variance is 0, they are missing, and fluxes are far too high."""
+    expected, counts = counts_of(sky)
+    given = observed(counts - sky, weights=None, variance=counts)
+    (made,), (lines,) = noisy_variance.with_smooth_variances([given])
+    assert len(lines) == 1 and "own counts" in lines[0]
+    assert (given.weights[counts == 0] == 0).all() and (made.weights > 0).mean() > 0.99
+    light = expected - sky
+    error = (made.weights * light**2).sum(axis=(1, 2)) ** -0.5
+    flux = (made.weights * light * made.data).sum(axis=(1, 2)) * error**2
+    assert (np.abs(flux - 1) < 3 * error).all()
+    assert error == pytest.approx((light**2 / expected).sum(axis=(1, 2)) ** -0.5, rel=0.25)
+
+
+@pytest.mark.parametrize("masked", ["a gap", "a mask", "bad pixels"])
+def test_other_dark_pixels_without_a_weight_stay_so(masked):
+    expected, counts = counts_of(50)
+    data, missing = counts - 50, np.zeros(WIDE, bool)
+    if masked == "a gap":
+        missing[:, 40:60] = True
+    else:
+        missing[np.random.default_rng(1).random(WIDE) < 0.1] = True
+    data[:, missing] = -100 if masked != "bad pixels" else 100
+    kind = "mask" if masked == "a mask" else "variance"
+    variance = np.where(missing & (kind == "variance"), 0, expected)
+    mask = {"mask": missing} if kind == "mask" else {}
+    given = observed(data, weights=None, variance=variance, **mask)
+    made, lines = noisy_variance.with_smooth_variances([given])
+    assert made[0] is given and lines == [[]]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_variance_of_a_crowded_image_is_left(seed):
     """There both rise with the stars' light between all pixels, not with noise."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.observation import with_weights
+from ...sky.psf import SIGMAS_A_FWHM
 from .filled import without_filled
-from .image import SIGMAS_A_FWHM
-from .levels import SIGMAS_A_MAD
 
 # [1] Smallest correlation of the deviations of variance and data from their neighbours, and [sigma]
 # smallest bias of a pixel's flux by it, that are mended: the sum over 100 pixels is off by half of
@@ -48,13 +47,15 @@ def with_smooth_variances(observations) -> tuple[tuple, list[list[str]]]:
     """
     made, lines = [], []
     for o in observations:
-        biases = [_bias(*pair) for pair in zip(o.data, o.weights, strict=True)]
+        given = [_variance(*pair, o.n_invalid > 0) for pair in zip(o.data, o.weights, strict=True)]
+        biases = [_bias(data, *own) for data, own in zip(o.data, given, strict=True)]
         wrong = np.flatnonzero(biases)
         if len(wrong):
             weights = o.weights.copy()
             for c in wrong:
                 width = o.psf.fwhm_px[c] / SIGMAS_A_FWHM
-                weights[c] = _smooth(o.weights[c], max(NARROW * width, MIN_WIDTH_PX))
+                variance, seen = given[c]
+                weights[c] = _smooth(variance, seen, max(NARROW * width, MIN_WIDTH_PX))
             o = with_weights(o, weights)
         made.append(o)
         lines.append(_lines(o, biases) if len(wrong) else [])
@@ -70,17 +71,33 @@ def _lines(o, biases):
     ]
 
 
-def _bias(data, weights):
+def _variance(data, weights, some_invalid):
+    """Variance (My, Mx), and the pixels that have one (bool).
+
+    some_invalid: whether pixels have weight 0 because of their variance. Those among them that are
+        the darkest of the image, spread over it, are counts of 0, whose variance is 0.
+    """
+    seen = weights > 0
+    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
+    if some_invalid and seen.any():
+        dark = ~seen & (data < data[seen].min())
+        beside = (dark[1:] & dark[:-1]).sum() + (dark[:, 1:] & dark[:, :-1]).sum()
+        # in gaps nearly all pixels have neighbours, of which each has two
+        part = dark.mean()
+        if dark.sum() >= MIN_PIXELS and beside < (1 + part) * dark.sum():
+            seen = seen | dark
+    return variance, seen
+
+
+def _bias(data, variance, seen):
     """Bias of a pixel's flux by its variance [sigma], towards zero; 0 if not significant.
 
-    data, weights (My, Mx)
+    data, variance, seen (My, Mx)
     """
     from scipy.ndimage import convolve
 
-    seen = weights > 0
-    if not seen.any() or np.ptp(weights[seen]) <= 1e-6 * weights.max():
+    if not seen.any() or np.ptp(variance[seen]) <= 1e-6 * variance.max():
         return 0.0
-    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
     inner = seen & (convolve(seen.astype(float), AROUND, mode="constant") > 0.99)
     if np.count_nonzero(inner) < 2 * MIN_PIXELS:
         return 0.0
@@ -88,26 +105,30 @@ def _bias(data, weights):
     around = convolve(data, AROUND, mode="constant")
     dark = inner & (around <= np.median(around[inner]))
     d, v = (convolve(image, ROUGHNESS, mode="constant")[dark] for image in (data, variance))
-    kept = np.abs(d) < CLIP * np.quantile(np.abs(d), WITHIN) / WITHIN_SIGMAS
+    kept = np.abs(d) < CLIP * _scatter(d)
     if np.count_nonzero(kept) < MIN_PIXELS or not v[kept].any():
         return 0.0
     (own, both), (_, other) = np.cov(d[kept], v[kept])
-    bias = both / np.median(convolve(variance, AROUND, mode="constant")[dark]) ** 1.5
+    level = convolve(variance, AROUND, mode="constant")[dark]
+    bias = both / (np.median(level) or level.mean() or variance[dark].mean()) ** 1.5
     # a right variance follows light, of which d holds what it has more than noise
     by_light = max(1 - variance[dark].mean() / own, 0)
     correlated = both**2 > (MIN_CORRELATION**2 + by_light) * own * other
     return float(bias) if correlated and bias > MIN_BIAS else 0.0
 
 
-def _smooth(weights, width):
+def _scatter(values):
+    """Standard deviation of values (n,) without outliers; also of counts that are mostly 0."""
+    size = np.abs(values)
+    return np.quantile(size, WITHIN) / WITHIN_SIGMAS or size.max()
+
+
+def _smooth(variance, seen, width):
     """Weights (My, Mx) of variances averaged over neighbours with a Gaussian `width` [px]."""
-    seen = weights > 0
-    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
     narrow, wide = (_around(variance, seen, w) for w in (width, WIDE * width / NARROW))
     excess = narrow - wide
-    sigma = SIGMAS_A_MAD * np.median(np.abs(excess[seen]))
-    variance = np.where(excess > LIGHT_SIGMAS * sigma, narrow, wide)
-    return np.divide(1, variance, out=np.zeros(weights.shape), where=seen & (variance > 0))
+    variance = np.where(excess > LIGHT_SIGMAS * _scatter(excess[seen]), narrow, wide)
+    return np.divide(1, variance, out=np.zeros(variance.shape), where=seen & (variance > 0))
 
 
 def _around(values, seen, width):
