@@ -15,7 +15,7 @@ from helpers.inspection import (
     with_photon_noise,
 )
 
-from clresample.deblending.inspection import levels, spoilt
+from clresample.deblending.inspection import levels, pixel_noise, spoilt
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -46,6 +46,23 @@ def test_correlated_noise_is_named_unless_it_is_declared(width, declared):
         assert 'noise="estimate"' in message and "(g)" in message and "(r)" in message
         ratio = float(message.partition("scatter ")[2].split()[0])
         assert ratio == pytest.approx(1 / noise.std(), rel=0.3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_noise_is_white_or_not_whatever_light_is_there(slope, seed):
+    """Smooth light makes neighbouring pixels alike, as correlated noise does."""
+    from scipy.ndimage import shift
+
+    white = np.random.default_rng(seed).normal(size=(48, 48))
+    y, x = np.indices((40, 40))
+    light, pixels = slope * np.hypot(y - 20, x - 20), np.ones((40, 40), bool)
+    pixels[15:25, 15:25] = False
+    noise = white[4:-4, 4:-4]
+    assert pixel_noise._is_white(noise + light, pixels)
+    for order in (1, 3):
+        moved = shift(white, (0.3, 0.2), order=order)[4:-4, 4:-4]
+        assert not pixel_noise._is_white(moved / moved.std() + light, pixels)
 
 
 @pytest.mark.parametrize("brightness", [100, 300, 3000])

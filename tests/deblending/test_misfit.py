@@ -112,6 +112,16 @@ def test_noise_that_weights_do_not_state_is_no_misfit(given):
         assert flagged(broken(times=(0.5, 1), seed=seed, **given)) == [True, False]
 
 
+def test_noise_of_many_times_the_weights_is_no_good_fit():
+    """Its errors are too small by as much."""
+    for seed in range(5):
+        found = with_misfit_status(broken(seed=seed, noise=10.0))
+        assert found.status == "misfit" and not summary(found)["good"]
+        (message,) = found.messages
+        stated = float(message.partition("about the model by ")[2].split()[0])
+        assert stated == pytest.approx(10, rel=0.1) and "scale weights" in message
+
+
 def test_light_without_a_source_is_not_taken_for_noise():
     """It fills a good part of the sky; no source is to blame, so that all are flagged."""
     found = with_misfit_status(broken(extra=300.0))

@@ -23,6 +23,9 @@ TRUSTED_CHI2 = 1.1
 # [sigma] Smoothed residuals above this count as residual light. Then the mean absolute value of
 # noise above it, in units of the scatter: 2 phi(2).
 LEFT_SIGMAS, LEFT_BY_NOISE = 2.0, 0.108
+# [1] Scatter of the sky's residuals, in units of the weights' noise, above which errors are wrong:
+# they are too small by as much. Of less the inspection warns, and fits are no worse than others.
+MAX_SCATTER = 4.0
 # [px] Lags (y, x) at which noise may be correlated although not declared; opposite lags are equal.
 LAGS_PX = (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)
 # [sigma] Residuals of the sky are clipped here before correlation, because of unlisted stars.
@@ -43,6 +46,7 @@ class Misfit:
         core says nothing of its fit; at least the flux error at fixed morphology
     whole_excess, whole_chi2 (2, C): the same for the pixels of all sources together, and of all
         pixels of the channel on the frame
+    scatter (C,) [1]: of the sky's residuals, in units of the weights' noise, 1 or more
     wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
     """
 
@@ -53,6 +57,7 @@ class Misfit:
     flux: np.ndarray
     whole_excess: np.ndarray
     whole_chi2: np.ndarray
+    scatter: np.ndarray
     wide_sigma: np.ndarray
     wide_part: np.ndarray
 
@@ -83,12 +88,17 @@ class Misfit:
 
     @property
     def is_wrong(self) -> bool:
+        """True if chi2 of a channel is not that of noise, or its noise not that of the weights."""
+        return self.is_unlike_noise or bool((self.scatter > MAX_SCATTER).any())
+
+    @property
+    def is_unlike_noise(self) -> bool:
         """True if chi2 of a channel is not that of noise, at the sources or on the frame."""
         return self.is_wrong_on_sources or bool((self.whole_excess[1] > MISFIT_SIGMAS).any())
 
     @property
     def is_wrong_on_sources(self) -> bool:
-        """`is_wrong` for the pixels of the sources alone."""
+        """`is_unlike_noise` for the pixels of the sources alone."""
         return bool((self.whole_excess[0] > MISFIT_SIGMAS).any())
 
 
@@ -105,7 +115,9 @@ def misfit_of(result) -> Misfit:
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
     fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own)]
     fields += [_observed_flux(result, remainders)]
-    fields += [*(rows[-2:] for rows in own[:2]), *extended_light(result, remainders)]
+    fields += [*(rows[-2:] for rows in own[:2])]
+    fields += [np.sqrt(np.concatenate([left.noise for left in remainders]))]
+    fields += extended_light(result, remainders)
     return Misfit(*fields)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..ended import Ended
 from ..result import noted
+from .misfit import MAX_SCATTER
 
 # Sources and channels that a message names.
 MAX_NAMED = 5
@@ -48,6 +49,15 @@ def with_source_misfit_status(result):
 
 def _message(result):
     misfit = result.misfit
+    loud = np.flatnonzero(misfit.scatter > MAX_SCATTER)
+    noise = ", ".join(f"{misfit.scatter[c]:.2g} ({result.channels[c]})" for c in loud[:MAX_NAMED])
+    if loud.size:
+        noise = (
+            f"pixels scatter about the model by {noise} times what the weights say: errors are too "
+            "small by as much; scale weights or variance"
+        )
+    if not misfit.is_unlike_noise:
+        return noise
     largest = np.nan_to_num(misfit.whole_chi2).max(axis=0)
     worst = np.argsort(-largest, kind="stable")[:MAX_NAMED]
     chi2 = ", ".join(f"{largest[c]:.2f} in {result.channels[c]}" for c in sorted(worst))
@@ -55,4 +65,4 @@ def _message(result):
     fraction = misfit.fraction()
     named = [s for s in np.argsort(-fraction, kind="stable")[:MAX_NAMED] if fraction[s] > 0]
     parts = ", ".join(f"source {s} leaves {100 * fraction[s]:.1f} % of its flux" for s in named)
-    return f"{text}; {parts}" if parts else text
+    return "; ".join(filter(None, (text, parts, noise)))

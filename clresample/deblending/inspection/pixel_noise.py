@@ -13,6 +13,10 @@ MIN_CORRELATION = 0.15
 # [1] The same of means over blocks, over that of white noise: 1.2 in 95 % of these channels. It
 # is less where light that is not smooth in FAR_PX makes pixels alike.
 MIN_BLOCK_SCATTER = 1.2
+# [1] The correlation of neighbouring second differences, which light that is smooth does not have:
+# -2/3 in white noise, with an error of 0.7 / sqrt(pixels), and -0.58 and more in resampled noise of
+# a correlation of 0.16 and more.
+WHITE_DIFFERENCES = -0.62
 # [1] The same for the scatter of pixels, over that of the weights, and its inverse: 0.92 to 1.08 in
 # these channels.
 MAX_RATIO = 1.25
@@ -21,8 +25,9 @@ MAX_RATIO = 1.25
 # pixels. It is at most 1.15 in 36 clean simulated images, 1.4 in stamps with a wide galaxy, and 1.7
 # and 1.8 in two of 147 cutouts of fields, of 1000 and 2300 pixels, by light of their neighbours.
 N_NEAR, UNEVEN_CLIP, UNEVEN_PARTS, MIN_UNEVEN, MAX_UNEVEN = 9, 10.0, (0.1, 0.9), 5000, 1.6
-# Smallest number of pixels: correlations then have errors of 0.02.
-MIN_PIXELS = 1000
+# Smallest number of pixels: their scatter then has an error of 5 %; of pixels for correlations,
+# which then have errors of 0.02.
+MIN_PIXELS, MIN_CORRELATED_PIXELS = 200, 1000
 # [px] Distance at which noise of resampled images is no longer correlated.
 FAR_PX = 8
 # [sigma] Pixels that deviate more are faint sources or defects.
@@ -37,15 +42,16 @@ def noise_lines(image, sky) -> list[str]:
     values, o = image.significance, image.observation
     pixels = sky.blocks.on_pixels(sky.dark, values.shape) & image.usable
     correlation, scatter = np.full((2, len(values)), np.nan)
-    many = pixels.sum(axis=(1, 2)) >= MIN_PIXELS
+    n_pixels = pixels.sum(axis=(1, 2))
     counts = np.maximum(sky.blocks.sums(pixels.astype(np.float32)), 1)
     smooth = sky.blocks.sums(np.where(pixels, values, 0)) / counts
     local = values - sky.blocks.on_pixels(smooth, values.shape)
-    for c in np.flatnonzero(many):
+    for c in np.flatnonzero(n_pixels >= MIN_PIXELS):
         own = _scatter(local[c][pixels[c]])
         if sky.block_scatter[c] > sky.blocks.side * max(own, 1):
             continue  # light: means over blocks of noise, however alike its pixels, scatter less
-        correlation[c] = _correlation(values[c], pixels[c])
+        if n_pixels[c] >= MIN_CORRELATED_PIXELS and not _is_white(values[c], pixels[c]):
+            correlation[c] = _correlation(values[c], pixels[c])
         # that of the blocks' means is of smooth noise, or of light that is brighter than the noise
         scatter[c] = max(own, min(np.hypot(own, sky.block_scatter[c] / sky.blocks.side), 1))
     lines = _uneven_lines(local, pixels, sky.blocks, o.channels)
@@ -107,16 +113,32 @@ def _correlation(values, pixels):
     away = np.abs(values - middle)
     kept = pixels & (away < CLIP * SIGMAS_A_MAD * np.median(away[pixels]))
     deviations = np.where(kept, values - middle, 0)
+    return _at(1, deviations, kept) - _at(FAR_PX, deviations, kept)
+
+
+def _is_white(values, pixels):
+    """Returns True if second differences of pixels (My, Mx) are those of white noise."""
+    differences, whole = values, pixels
+    along_y = np.s_[:-2], np.s_[1:-1], np.s_[2:]
+    along_x = np.s_[:, :-2], np.s_[:, 1:-1], np.s_[:, 2:]
+    for low, middle, high in (along_y, along_x):
+        differences = differences[low] - 2 * differences[middle] + differences[high]
+        whole = whole[low] & whole[middle] & whole[high]
+    if not whole.any():
+        return False
+    away = np.abs(differences)
+    kept = whole & (away < CLIP * SIGMAS_A_MAD * np.median(away[whole]))
+    return _at(1, np.where(kept, differences, 0), kept) < WHITE_DIFFERENCES
+
+
+def _at(lag, deviations, kept):
+    """Correlation of deviations (My, Mx) with those `lag` pixels away, of the pixels kept alone."""
     power = np.vdot(deviations, deviations) / max(np.count_nonzero(kept), 1)
-
-    def at(lag):
-        both, sums = 0, 0.0
-        for one, other in ((np.s_[lag:], np.s_[:-lag]), (np.s_[:, lag:], np.s_[:, :-lag])):
-            both += np.count_nonzero(kept[one] & kept[other])
-            sums += np.vdot(deviations[one], deviations[other])
-        return sums / max(both * power, 1e-30)
-
-    return at(1) - at(FAR_PX)
+    both, sums = 0, 0.0
+    for one, other in ((np.s_[lag:], np.s_[:-lag]), (np.s_[:, lag:], np.s_[:, :-lag])):
+        both += np.count_nonzero(kept[one] & kept[other])
+        sums += np.vdot(deviations[one], deviations[other])
+    return sums / max(both * power, 1e-30)
 
 
 def _parts(channels, values, chosen):
