@@ -72,6 +72,14 @@ def test_peak_is_the_matched_filters_signal_to_noise():
     assert abs(found.peaks[0] - expected) < 3  # sigma of its own noise
 
 
+@pytest.mark.parametrize("size", [0, 1.2])
+@pytest.mark.parametrize("place", [(40.4, 45.2), (30.5, 50.6), (41.0, 44.8)])
+def test_positions_are_between_pixels(place, size):
+    observations, frame = instruments([(*place, 2000, 4000)], size=size)
+    found = detect(observations, frame)
+    assert len(found.sources) == 1 and nearest(found, *place) < 0.1
+
+
 def test_noise_alone_has_unit_scatter_and_holds_no_source():
     for seed in range(4):
         observations, frame = instruments([], seed=seed)
