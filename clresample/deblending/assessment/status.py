@@ -7,6 +7,7 @@ import numpy as np
 from ..ended import Ended
 from ..result import noted
 from .misfit import MAX_SCATTER
+from .photon_noise import photon_noise_lines
 
 # Sources and channels that a message names.
 MAX_NAMED = 5
@@ -65,4 +66,4 @@ def _message(result):
     fraction = misfit.fraction()
     named = [s for s in np.argsort(-fraction, kind="stable")[:MAX_NAMED] if fraction[s] > 0]
     parts = ", ".join(f"source {s} leaves {100 * fraction[s]:.1f} % of its flux" for s in named)
-    return "; ".join(filter(None, (text, parts, noise)))
+    return "; ".join(filter(None, (text, parts, *photon_noise_lines(result), noise)))

@@ -211,7 +211,7 @@ def _level_lines(image, sky, shown, expected, fitted):
                 f"{what}: pixels without a source have the level "
                 f"{_parts(image, expected.level, chosen)} a pixel; "
                 + (
-                    "a constant is fitted near this level"
+                    "a constant is fitted near this level, light from beyond the image included"
                     if fitted
                     else f"every flux includes its share of it; {cure}, or give fit_sky=True"
                 )

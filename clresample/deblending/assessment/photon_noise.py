@@ -1,0 +1,59 @@
+"""Recognises weights that leave out the photon noise of the sources' own light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..posterior.residuals import remainder
+
+# Rounds of weighted least squares for 1 / gain, from a variance without photon noise.
+N_ROUNDS = 6
+# Photon noise over the weights' own from which pixels are bright, and the smallest number of them.
+BRIGHT, MIN_BRIGHT = 0.5, 100
+# chi2 per bright pixel and correlation of neighbours, photon noise included, of noise: 0.97 to 1.07
+# and -0.06 to 0.02 in Rubin's bands of simulated blends. Errors of a model are alike in neighbours,
+# and grow with the square of its light.
+CHI2, MAX_CORRELATION = (0.8, 1.25), 0.15
+
+
+def photon_noise_lines(result) -> list[str]:
+    """A message if residuals are noise once the variance has the model's light over a gain."""
+    named = []
+    for i, o in enumerate(result.observations):
+        left, weights = remainder(result, i), o.whitened.weights
+        sky = result.sky[result.channel_slices()[i], None, None]
+        light = np.maximum(o.whiten(result.model(i) - sky), 0.0) * weights
+        for c, name in enumerate(o.channels):
+            part = _missing_variance(left.residual[c] ** 2 / left.noise[c], light[c], left, c)
+            if part > 0:
+                named.append(f"{1 / (part * left.noise[c]):.2g} ({name})")
+    if not named:
+        return []
+    return [
+        "but the noise grows with the sources' light as photons' does, of which the weights have "
+        f"nothing: add light / gain to the variance, with gains near {', '.join(named)}"
+    ]
+
+
+def _missing_variance(squares, light, left, c):
+    """1 / gain of a channel, 0 if its residuals are not those of photons.
+
+    squares (My, Mx) [1]: of the residuals, in units of the noise; light (My, Mx) [1 / counts]:
+        model over the weights' variance; left: its Remainder
+    """
+    used = left.used[c] & (left.owner[c] >= 0)
+    x, y, part = light[used], squares[used] - 1, 0.0
+    for _ in range(N_ROUNDS):
+        q = x / (1 + part * x) ** 2
+        part = max((q * y).sum() / max((q * x).sum(), 1e-300), 0.0)
+    bright = used & (part * light > BRIGHT)
+    if bright.sum() < MIN_BRIGHT:
+        return 0.0
+    residual = left.residual[c] / np.sqrt(left.noise[c] * (1 + part * light))
+    chi2 = np.square(residual[bright]).mean()
+    sums, n = 0.0, 0
+    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        both = bright[one] & bright[other]
+        sums, n = sums + (residual[one] * residual[other])[both].sum(), n + both.sum()
+    is_noise = CHI2[0] < chi2 < CHI2[1] and abs(sums) < MAX_CORRELATION * chi2 * n
+    return part if is_noise else 0.0
