@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 
 from ..sky.grid import Grid
 from ..sky.psf import PSF
-from ..sky.wcs import local_axes
+from ..sky.wcs import cutout_wcs, local_axes
 from .optional import require
 
 
@@ -25,6 +25,9 @@ def grid_of(image) -> Grid:
     galsim = require("galsim", "galsim")
     wcs = image.wcs or galsim.PixelScale(1.0)
     shape = image.array.shape
+    if isinstance(wcs, galsim.AstropyWCS):
+        first = image.ymin - 1 - wcs.origin.y, image.xmin - 1 - wcs.origin.x
+        return Grid.from_wcs(cutout_wcs(wcs.wcs, *first), shape)
     if wcs.isCelestial():
         header = fits.Header()
         wcs.writeToFitsHeader(header, image.bounds)

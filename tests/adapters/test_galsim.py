@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from astropy.wcs import WCS
+from helpers.headers import header
 
 from clresample import PSF, ExtendedSource, Grid, Observation, Resampler, deblend
 from clresample.adapters.galsim import as_galsim, grid_of, image_of, profile_of, psf_of
@@ -28,6 +30,21 @@ def test_a_grid_of_a_plain_image_is_flat():
     grid = grid_of(galsim.Image(np.zeros((4, 6)), scale=0.3))
     assert grid.shape == (4, 6)
     assert grid.pixel_scale_arcsec == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("given", ["wcs", "header"])
+@pytest.mark.parametrize("bounds", [(1, 30, 1, 20), (-4, 25, 8, 27)])
+def test_a_grid_of_a_wcs_of_astropy(given, bounds):
+    """Pixels that galsim has at the same places, wherever the image begins."""
+    wcs = WCS(header((20, 30), CROTA2=25.0))
+    own = {"wcs": wcs} if given == "wcs" else {"header": wcs.to_header()}
+    image = galsim.Image(galsim.BoundsI(*bounds), wcs=galsim.AstropyWCS(**own))
+    found = grid_of(image)
+    assert found.shape == image.array.shape
+    for y, x in ((0, 0), (3, 17)):
+        place = image.wcs.toWorld(galsim.PositionD(image.xmin + x, image.ymin + y))
+        ra, dec = place.ra / galsim.degrees, place.dec / galsim.degrees
+        np.testing.assert_allclose(found.pixel(ra % 360, dec), (y, x), atol=1e-6)
 
 
 def test_refuses_a_wcs_that_varies_on_a_plane():
