@@ -59,9 +59,6 @@ MIN_AREA_BESIDE = 0.125
 # PSF is known to some percent (UNEVEN): of 9 peaks left about each of two stars of signal to noise
 # 5500 and 6300 none was a source
 POINT_WIDTH = 2.5
-# [px] Steps of positions: they have larger errors below a signal to noise of 20, and a finer one
-# could differ between two searches of one source by their rounding errors.
-PART_PX = 1 / 16
 ALL = "all"  # the name of the combined image
 
 
@@ -70,7 +67,7 @@ class Detection(ShownDetection):
     """Sources that `detect` or `detect_more` found, S of them, stars first, brightest peak first.
 
     sources (S,): first a free PointSource for each star with a saturated or masked core, see
-        star_light.py, then ExtendedSource, at the maximum of their peak
+        star_light.py, then ExtendedSource
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
@@ -310,9 +307,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         new = [one for one in new if not held[sharp][tuple(np.rint(one[0]).astype(int))]]
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
-    searched = {o.label: signal.flat() for o, signal in zip(observations, levelled, strict=True)}
-    searched[ALL] = best
-    positions = [_top(searched[found.labels[i]], found.positions[i]) for i in order]
+    positions = [found.position_of(i) for i in order]
     points = [
         PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
     ]
@@ -368,12 +363,6 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
         if is_a_source(at, height, model, image, signals, centres, fwhm, scale):
             found.append((top, height))
     return found
-
-
-def _top(image, position):
-    """The maximum (y, x) of the peak of an image at a pixel, in steps of PART_PX."""
-    y, x = np.rint(parabolic_peak(image, position) / PART_PX) * PART_PX
-    return float(y), float(x)
 
 
 def _fwhm_px(observation, frame):

@@ -11,19 +11,20 @@ import numpy as np
 from .extent import bounding_boxes_overlap, grid_intersection, grid_union, grids_overlap
 from .grid import Grid, as_grid
 from .observation import as_observations, check_observations
-from .psf import PSF, SIGMAS_A_FWHM
+from .psf import PSF
 from .validation.observed import as_psf
 
 # [sigma] Half-width of the model PSF's image: less than 1e-16 of the light, float64's rounding,
 # lies beyond. Larger images only cost time.
 REACH = 8.5
-# Number of model pixels along a pixel where dithered images show more than one of them. A PSF of
+# Number of model pixels along a pixel where dithered images resolve more than one of them. A PSF of
 # one pixel has 3 % of its transform left at the limit of half pixels.
-FINER = 2
-# [px] Distance of one image's pixels from another's that shows more than the other.
+REFINEMENT = 2
+# [cycles / model px], [1] Frequency and least transform there of a PSF that the model's own PSF, of
+# 0.41, hardly resolves: Moffat PSFs (beta = 3.5) of up to 2 pixels FWHM.
+NARROW_FREQUENCY, MIN_NARROW_TRANSFORM = 0.25, 0.25
+# [px] Distance between the pixels of two images from which they are dithered.
 MIN_DITHER_PX = 0.1
-# [px] Standard deviation of a pixel, which adds to a Gaussian's.
-PIXEL_SIGMA = 1 / math.sqrt(12)
 # Relative difference below which two pixel scales are equal: the precision of headers.
 SAME_SCALE = 1e-6
 
@@ -74,13 +75,13 @@ class Frame:
 
 
 def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> Frame:
-    """Frame on the finest pixels among the observations, with a Gaussian PSF.
+    """Frame on pixels as the observations need them, with a Gaussian PSF.
 
     observations: what will be fitted; see `check_observations`
     grid: Grid to use unchanged; None = the pixels and orientation of the observation with the
-        smallest pixels (the first if several are equal), as many pixels as needed. Pixels half as
-        long if two or more observations, dithered or rotated, have a narrower PSF than the model
-        then has: together they show more than one of them, which larger pixels do not hold
+        smallest pixels (the first if several are equal), as many pixels as needed; its pixels
+        halved if two or more observations, dithered or rotated, have a PSF of less than about two
+        of them: together these resolve more than each does
     psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel;
         no more than the frame has pixels along a side
     shared: cover the intersection of the observations' footprints instead of their union
@@ -101,8 +102,8 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         scales = np.array([o.grid.pixel_scale_arcsec for o in observations])
         like = observations[int(np.argmax(scales <= (1 + SAME_SCALE) * scales.min()))].grid
         _check_connected(observations, like)
-        if _show_more(observations, like, psf_sigma_px):
-            like = like.finer(FINER)
+        if _resolve_more(observations, like):
+            like = like.refined(REFINEMENT)
         extent = grid_intersection if shared else grid_union
         grid = extent([o.grid for o in observations], like=like)
     grid = as_grid("grid", grid)
@@ -129,25 +130,31 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
 @lru_cache(maxsize=4)
 def model_psf(sigma_px=0.8):
     """The Gaussian of this standard deviation [model px] in model pixels."""
-    radius = math.ceil(REACH * math.hypot(sigma_px, PIXEL_SIGMA))
+    radius = math.ceil(REACH * math.hypot(sigma_px, 1 / math.sqrt(12)))
     return PSF.gaussian(sigma_px, n_pixels=2 * radius + 1)
 
 
-def _show_more(observations, like, psf_sigma_px):
-    """Returns True if observations of narrower PSFs than the model's have pixels that differ."""
-    least = SIGMAS_A_FWHM * math.hypot(psf_sigma_px, PIXEL_SIGMA) * like.pixel_scale_arcsec
-    narrow = [o for o in observations if o.psf.fwhm_px.min() * o.grid.pixel_scale_arcsec < least]
+def _resolve_more(observations, like):
+    """Returns True if dithered observations together resolve more than the pixels of `like`."""
+    narrow = [o for o in observations if _is_narrow(o, like)]
     if not narrow:
         return False
-    first, *others = narrow
-    at = np.array([[0, 0, 10], [0, 10, 0]])
+    first, *others = (o.grid for o in narrow)
 
-    def is_apart(grid):
-        n, m = (np.array(grid.shape)[:, None] - 1) // 2 + at
-        away = grid.positions_in(first.grid, n, m)
+    def is_dithered(grid):
+        ends = [(0, n - 1) for n in grid.shape]
+        away = grid.positions_in(first, *np.meshgrid(*ends, indexing="ij"))
         return bool((np.abs(away - np.rint(away)) > MIN_DITHER_PX).any())
 
-    return any(is_apart(o.grid) for o in others)
+    return any(is_dithered(grid) for grid in others)
+
+
+def _is_narrow(observation, like):
+    """Returns True if one of an observation's PSFs has too much transform for pixels of `like`."""
+    scale = observation.grid.pixel_scale_arcsec / like.pixel_scale_arcsec
+    nu = NARROW_FREQUENCY * scale  # [cycles / observed px]
+    along = observation.psf.otf([nu], [0.0]), observation.psf.otf([0.0], [nu])
+    return bool((np.abs(along).mean(axis=0) > MIN_NARROW_TRANSFORM).any())
 
 
 def _check_connected(observations, like):

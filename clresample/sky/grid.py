@@ -26,9 +26,9 @@ from .wcs import (
     celestial_wcs,
     convert,
     cutout_wcs,
-    finer_wcs,
     pixel_scale,
     pixel_to_world,
+    refined_wcs,
     tangent_wcs,
     world_to_pixel,
 )
@@ -141,11 +141,10 @@ class Grid(GridDisplay, ABC):
         """Grid of the `shape` (Ny, Nx) pixels from (y0, x0) on; they may lie outside this one."""
 
     @abstractmethod
-    def finer(self, factor) -> Grid:
-        """Grid of the same sky on pixels with sides 1 / factor, a whole number, as long.
+    def refined(self, factor) -> Grid:
+        """Grid of the same sky on pixels with sides 1 / factor as long, factor a whole number.
 
-        Distortions are left out, except those of the projection: the same sky then lies off by as
-        much.
+        Distortions are left out, except those of the projection: the sky is off by as much.
         """
 
     @abstractmethod
@@ -246,10 +245,10 @@ class FlatGrid(Grid):
             check_image_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0)
         )
 
-    def finer(self, factor):
+    def refined(self, factor):
         """The Jacobian over the factor, with the outer edges of these pixels."""
         origin = self.origin + self.jacobian @ np.full(2, (1 / factor - 1) / 2)
-        return FlatGrid(_times(self.shape, factor), self.jacobian / factor, origin)
+        return FlatGrid(_refined_shape(self.shape, factor), self.jacobian / factor, origin)
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A gnomonic WCS (ICRS) that touches the flat sky at (y, x) = (0, 0)."""
@@ -309,9 +308,9 @@ class WcsGrid(Grid):
         """The same WCS with its reference pixel, and those of its distortions, moved."""
         return WcsGrid(check_image_shape(shape), cutout_wcs(self.wcs, y0, x0))
 
-    def finer(self, factor):
+    def refined(self, factor):
         """The WCS with smaller pixels, without SIP and tables of distortion."""
-        return WcsGrid(_times(self.shape, factor), finer_wcs(self.to_wcs(), factor))
+        return WcsGrid(_refined_shape(self.shape, factor), refined_wcs(self.to_wcs(), factor))
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A copy of the WCS, of an Ape14Wcs its FITS approximation."""
@@ -351,8 +350,8 @@ def as_grid(name, grid, shape=None) -> Grid:
     return Grid.from_wcs(grid, shape)
 
 
-def _times(shape, factor):
-    """A shape (2,) on pixels `factor` times finer."""
+def _refined_shape(shape, factor):
+    """A shape (2,) on pixels of 1 / factor the length."""
     return tuple(factor * n for n in shape)
 
 

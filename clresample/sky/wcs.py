@@ -208,7 +208,7 @@ def cutout_wcs(wcs, y0, x0):
     return wcs
 
 
-def finer_wcs(wcs, factor):
+def refined_wcs(wcs, factor):
     """An astropy WCS of pixels with sides 1 / factor as long, without SIP and distortion tables."""
     wcs = wcs.deepcopy()
     wcs.sip = wcs.cpdis1 = wcs.cpdis2 = wcs.det2im1 = wcs.det2im2 = None

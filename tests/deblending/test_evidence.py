@@ -85,6 +85,8 @@ def test_first_strengths_are_those_that_slopes_were_drawn_with(scale, strength):
 def test_sources_that_determine_little_begin_with_the_priors_strengths(evidence):
     powers = np.full(3, 1e6)
     np.testing.assert_array_equal(evidence.first_strengths(powers, [0.1, 0]), PRIOR.strengths)
+    lost = np.array([np.inf, 1.0, np.nan])  # slopes that overflow
+    np.testing.assert_array_equal(evidence.first_strengths(lost, [1e6, 0]), PRIOR.strengths)
 
 
 def test_determined_parameters_count_those_of_the_posterior():

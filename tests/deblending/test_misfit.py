@@ -11,7 +11,10 @@ from clresample import Flag, Grid, Observation, PointSource, catalogue, deblend,
 from clresample.deblending.assessment.cores import star_variance
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.psf_width import width_errors
-from clresample.deblending.assessment.status import with_misfit_status
+from clresample.deblending.assessment.status import (
+    with_misfit_status,
+    with_source_misfit_status,
+)
 from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, _kernels, fine_scatter
 from clresample.sky.observation import masked
 from clresample.sky.psf import PSF
@@ -120,6 +123,7 @@ def test_noise_of_many_times_the_weights_is_no_good_fit():
         (message,) = found.messages
         stated = float(message.partition("about the model by ")[2].split()[0])
         assert stated == pytest.approx(10, rel=0.1) and "scale weights" in message
+        assert with_source_misfit_status(found) is found  # as a piece of a field too
 
 
 def test_light_without_a_source_is_not_taken_for_noise():

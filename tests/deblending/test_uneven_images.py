@@ -46,19 +46,38 @@ def test_counts_of_0_have_a_variance_too(sky):
     assert error == pytest.approx((light**2 / expected).sum(axis=(1, 2)) ** -0.5, rel=0.25)
 
 
-@pytest.mark.parametrize("masked", ["a gap", "a mask", "bad pixels"])
-def test_other_dark_pixels_without_a_weight_stay_so(masked):
+def test_a_gap_of_no_counts_stays_without_a_weight():
+    _, counts = counts_of(0.5)
+    counts[:, 40:47] = 0
+    given = observed(counts - 0.5, weights=None, variance=counts)
+    (made,), (lines,) = noisy_variance.with_smooth_variances([given])
+    assert "own counts" in lines[0] and not made.weights[:, 40:47].any()
+    assert (made.weights > 0).mean() > 0.85
+
+
+def test_a_mask_stays_beside_counts_of_0_which_are_named():
+    """Nothing tells masked pixels of 0 counts from others."""
+    _, counts = counts_of(0.5)
+    mask = np.zeros(WIDE, bool)
+    mask[:, [20, 71, 90]] = mask[40:60] = True
+    given = observed(counts - 0.5, weights=None, variance=counts, mask=mask)
+    (made,), (lines,) = noisy_variance.with_smooth_variances([given])
+    assert not made.weights[:, mask].any() and "a variance of 0: 4" in lines[-1]
+
+
+@pytest.mark.parametrize("how", ["a gap", "bad pixels", "dead columns"])
+def test_dark_pixels_without_a_weight_are_no_counts(how):
+    """Their other pixels have counts of 50."""
     expected, counts = counts_of(50)
-    data, missing = counts - 50, np.zeros(WIDE, bool)
-    if masked == "a gap":
+    missing = np.zeros(WIDE, bool)
+    if how == "a gap":
         missing[:, 40:60] = True
+    elif how == "dead columns":
+        missing[:, [20, 31, 40, 56, 77, 90]] = True
     else:
         missing[np.random.default_rng(1).random(WIDE) < 0.1] = True
-    data[:, missing] = -100 if masked != "bad pixels" else 100
-    kind = "mask" if masked == "a mask" else "variance"
-    variance = np.where(missing & (kind == "variance"), 0, expected)
-    mask = {"mask": missing} if kind == "mask" else {}
-    given = observed(data, weights=None, variance=variance, **mask)
+    data = np.where(missing, -100.0 if how != "bad pixels" else 100.0, counts - 50)
+    given = observed(data, weights=None, variance=np.where(missing, 0, expected))
     made, lines = noisy_variance.with_smooth_variances([given])
     assert made[0] is given and lines == [[]]
 

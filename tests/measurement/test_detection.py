@@ -237,3 +237,11 @@ def test_a_constant_sky_changes_no_sources(level):
     expected = [source.position_px for source in detect(observations, frame).sources]
     over = [with_data(o, o.data + level) for o in observations]
     assert [source.position_px for source in detect(over, frame).sources] == expected
+
+
+@pytest.mark.parametrize("place", [(46.6, 42.8), (46.9, 40.1), (33.2, 47.7)])
+def test_companions_keep_their_places_between_pixels(place):
+    """Those of the residual that found them, not of the flank they lie on."""
+    observations, frame = instruments([(40, 45, 20000, 20000), (*place, 1500, 1500)], size=0.5)
+    found = detect(observations[:1], frame)
+    assert len(found.sources) == 2 and nearest(found, *place) < 0.3

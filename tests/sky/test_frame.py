@@ -49,6 +49,10 @@ def test_of_equal_pixels_the_first_are_taken():
 
 
 NARROW = PSF.gaussian(0.6, n_pixels=17)
+# the same between four pixels, where a width that counts pixels is twice as large
+BETWEEN = PSF(
+    np.exp(-0.5 * ((np.indices((18, 18)) - 8.5) ** 2).sum(axis=0) / (0.6**2 + 1 / 12)),
+)
 
 
 def placed(kind, center, angle=0.0):
@@ -68,6 +72,7 @@ def placed(kind, center, angle=0.0):
     [
         ((0.5, 0.0), 0.0, NARROW, True),
         ((0.0, 0.0), 40.0, NARROW, True),
+        ((0.0, 0.0), 1.0, BETWEEN, True),
         ((1.0, -2.0), 0.0, NARROW, False),  # the same pixels
         ((0.0, 0.5), 0.0, PSF_OUT, False),
     ],
@@ -87,7 +92,8 @@ def test_dithered_images_of_a_narrow_psf_have_finer_model_pixels(
     mapping = first.grid.map_to(frame.grid)
     np.testing.assert_allclose(mapping.matrix, np.eye(2) * (2 if is_finer else 1), atol=1e-6)
     # their outer edges meet
-    assert mapping.offset - np.floor(mapping.offset) == pytest.approx(0.5 * is_finer, abs=1e-5)
+    half = mapping.offset - 0.5 * is_finer
+    np.testing.assert_allclose(half, np.rint(half), atol=1e-5)
     assert model_frame([first]).grid.pixel_scale_arcsec == pytest.approx(0.3, rel=1e-6)
 
 

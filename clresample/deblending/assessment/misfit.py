@@ -46,7 +46,8 @@ class Misfit:
         core says nothing of its fit; at least the flux error at fixed morphology
     whole_excess, whole_chi2 (2, C): the same for the pixels of all sources together, and of all
         pixels of the channel on the frame
-    scatter (C,) [1]: of the sky's residuals, in units of the weights' noise, 1 or more
+    scatter (C,) [1]: of the sky's residuals, in units of the weights' noise, 1 or more; 1 of fewer
+        than MIN_PIXELS of them
     wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
     """
 
@@ -89,7 +90,12 @@ class Misfit:
     @property
     def is_wrong(self) -> bool:
         """True if chi2 of a channel is not that of noise, or its noise not that of the weights."""
-        return self.is_unlike_noise or bool((self.scatter > MAX_SCATTER).any())
+        return self.is_unlike_noise or self.is_noisier
+
+    @property
+    def is_noisier(self) -> bool:
+        """True if the noise of a channel is many times that of the weights."""
+        return bool((self.scatter > MAX_SCATTER).any())
 
     @property
     def is_unlike_noise(self) -> bool:

@@ -6,19 +6,20 @@ import numpy as np
 
 from ..posterior.residuals import remainder
 
-# Rounds of weighted least squares for 1 / gain, from a variance without photon noise.
-N_ROUNDS = 6
+# Channels that a message names. Then the rounds of weighted least squares for 1 / gain, from a
+# variance without photon noise.
+MAX_NAMED, N_ROUNDS = 6, 6
 # Photon noise over the weights' own from which pixels are bright, and the smallest number of them.
-BRIGHT, MIN_BRIGHT = 0.5, 100
+MIN_PHOTON_NOISE, MIN_BRIGHT_PIXELS = 0.5, 100
 # chi2 per bright pixel and correlation of neighbours, photon noise included, of noise: 0.97 to 1.07
 # and -0.06 to 0.02 in Rubin's bands of simulated blends. Errors of a model are alike in neighbours,
 # and grow with the square of its light.
-CHI2, MAX_CORRELATION = (0.8, 1.25), 0.15
+CHI2_RANGE, MAX_CORRELATION = (0.8, 1.25), 0.15
 
 
 def photon_noise_lines(result) -> list[str]:
     """A message if residuals are noise once the variance has the model's light over a gain."""
-    named = []
+    named: list[str] = []
     for i, o in enumerate(result.observations):
         left, weights = remainder(result, i), o.whitened.weights
         sky = result.sky[result.channel_slices()[i], None, None]
@@ -26,13 +27,23 @@ def photon_noise_lines(result) -> list[str]:
         for c, name in enumerate(o.channels):
             part = _missing_variance(left.residual[c] ** 2 / left.noise[c], light[c], left, c)
             if part > 0:
-                named.append(f"{1 / (part * left.noise[c]):.2g} ({name})")
+                part = part * left.noise[c] + _stated_variance(weights[c], light[c])
+                named.append(f"{1 / part:.2g} ({name})")
     if not named:
         return []
     return [
-        "but the noise grows with the sources' light as photons' does, of which the weights have "
-        f"nothing: add light / gain to the variance, with gains near {', '.join(named)}"
+        "but the noise grows with the sources' light as that of photons does, of which the weights "
+        "have too little: the variance must have light / gain, with gains near "
+        f"{', '.join(named[:MAX_NAMED])}"
     ]
+
+
+def _stated_variance(weights, light):
+    """1 / gain that weights (My, Mx) have already, by the rise of their variance with the light."""
+    used = weights > 0
+    variance, counts = 1 / weights[used], light[used] / weights[used]
+    dark = np.median(variance[counts <= np.median(counts)])
+    return max((counts * (variance - dark)).sum() / max((counts**2).sum(), 1e-300), 0.0)
 
 
 def _missing_variance(squares, light, left, c):
@@ -46,8 +57,8 @@ def _missing_variance(squares, light, left, c):
     for _ in range(N_ROUNDS):
         q = x / (1 + part * x) ** 2
         part = max((q * y).sum() / max((q * x).sum(), 1e-300), 0.0)
-    bright = used & (part * light > BRIGHT)
-    if bright.sum() < MIN_BRIGHT:
+    bright = used & (part * light > MIN_PHOTON_NOISE)
+    if bright.sum() < MIN_BRIGHT_PIXELS:
         return 0.0
     residual = left.residual[c] / np.sqrt(left.noise[c] * (1 + part * light))
     chi2 = np.square(residual[bright]).mean()
@@ -55,5 +66,5 @@ def _missing_variance(squares, light, left, c):
     for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         both = bright[one] & bright[other]
         sums, n = sums + (residual[one] * residual[other])[both].sum(), n + both.sum()
-    is_noise = CHI2[0] < chi2 < CHI2[1] and abs(sums) < MAX_CORRELATION * chi2 * n
+    is_noise = CHI2_RANGE[0] < chi2 < CHI2_RANGE[1] and abs(sums) < MAX_CORRELATION * chi2 * n
     return part if is_noise else 0.0

@@ -41,7 +41,8 @@ def with_source_misfit_status(result):
 
     Its status becomes "converged" again if the model describes its own sources.
     """
-    if result.status != Ended.MISFIT or result.misfit.is_wrong_on_sources:
+    misfit = result.misfit
+    if result.status != Ended.MISFIT or misfit.is_wrong_on_sources or misfit.is_noisier:
         return result
     message = _message(result)
     kept = tuple(line for line in result.messages if line != message)

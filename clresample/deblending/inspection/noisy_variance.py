@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ...sky.observation import with_weights
@@ -13,6 +15,9 @@ from .filled import without_filled
 # its error. Sky of 400 counts has 0.05, variances without the data's noise less than 0.005.
 MIN_CORRELATION, MIN_BIAS = 0.3, 0.05
 MIN_PIXELS = 300  # correlations then have errors of 0.06
+# Number of blocks of counts of 0 in an image by chance that are taken for gaps, and [px] the side
+# of cells in which these counts are a fraction of all.
+BY_CHANCE, CELL_PX = 0.01, 15
 CLIP = 4.0  # [sigma] Pixels that deviate more are sources or defects.
 # Part of a Gaussian within these sigmas, by which sigma is found: the median of counts may be 0.
 WITHIN, WITHIN_SIGMAS = 0.9, 1.645
@@ -47,18 +52,24 @@ def with_smooth_variances(observations) -> tuple[tuple, list[list[str]]]:
     """
     made, lines = [], []
     for o in observations:
-        given = [_variance(*pair, o.n_invalid > 0) for pair in zip(o.data, o.weights, strict=True)]
-        biases = [_bias(data, *own) for data, own in zip(o.data, given, strict=True)]
+        seen, more = o.weights > 0, []
+        if o.n_invalid:
+            dark = np.stack([_counts_of_0(*pair) for pair in zip(o.data, seen, strict=True)])
+            if np.count_nonzero(~seen) <= o.n_invalid:
+                seen |= dark
+            elif dark.any():
+                more = _left_out_lines(o, dark)
+        variance = np.divide(1, o.weights, out=np.zeros(seen.shape), where=o.weights > 0)
+        biases = [_bias(*channel) for channel in zip(o.data, variance, seen, strict=True)]
         wrong = np.flatnonzero(biases)
         if len(wrong):
             weights = o.weights.copy()
             for c in wrong:
                 width = o.psf.fwhm_px[c] / SIGMAS_A_FWHM
-                variance, seen = given[c]
-                weights[c] = _smooth(variance, seen, max(NARROW * width, MIN_WIDTH_PX))
+                weights[c] = _smooth(variance[c], seen[c], max(NARROW * width, MIN_WIDTH_PX))
             o = with_weights(o, weights)
         made.append(o)
-        lines.append(_lines(o, biases) if len(wrong) else [])
+        lines.append((_lines(o, biases) if len(wrong) else []) + more)
     return tuple(made), lines
 
 
@@ -71,22 +82,38 @@ def _lines(o, biases):
     ]
 
 
-def _variance(data, weights, some_invalid):
-    """Variance (My, Mx), and the pixels that have one (bool).
+def _left_out_lines(o, dark):
+    """A message about counts of 0, (C, My, Mx), that have no weight."""
+    pairs = zip(o.channels, dark.mean(axis=(1, 2)), strict=True)
+    some = ", ".join(f"{100 * part:.0f} % ({name})" for name, part in pairs if part)
+    return [
+        "pixels darker than all others have no weight, as if of 0 counts and a variance of 0: "
+        f"{some} of all; fluxes are too high without them; give a variance from a smoothed image "
+        "or a model"
+    ]
 
-    some_invalid: whether pixels have weight 0 because of their variance. Those among them that are
-        the darkest of the image, spread over it, are counts of 0, whose variance is 0.
+
+def _counts_of_0(data, seen):
+    """Selects pixels (My, Mx) without a weight that are counts of 0, whose variance is 0.
+
+    They are darker than all others, and not in blocks that their fraction does not explain, such as
+    gaps, nor beside masked pixels that are not dark. seen (My, Mx): those with a weight
     """
-    seen = weights > 0
-    variance = np.divide(1, weights, out=np.zeros(weights.shape), where=seen)
-    if some_invalid and seen.any():
-        dark = ~seen & (data < data[seen].min())
-        beside = (dark[1:] & dark[:-1]).sum() + (dark[:, 1:] & dark[:, :-1]).sum()
-        # in gaps nearly all pixels have neighbours, of which each has two
-        part = dark.mean()
-        if dark.sum() >= MIN_PIXELS and beside < (1 + part) * dark.sum():
-            seen = seen | dark
-    return variance, seen
+    from scipy.ndimage import binary_dilation, binary_opening, uniform_filter
+
+    dark = ~seen & (data < data[seen].min(initial=np.inf))
+    if not (dark.any() and seen.any()):
+        return np.zeros_like(dark)
+    fraction = dark.sum() / (dark | seen).sum()
+    side = math.ceil(math.sqrt(math.log(dark.size / BY_CHANCE) / -math.log(fraction)))
+    gaps = binary_opening(dark, np.ones((side, side)))
+    dark &= ~binary_dilation(gaps | (~seen & ~dark), np.ones((3, 3)))
+    beside = (dark[1:] & dark[:-1]).sum() + (dark[:, 1:] & dark[:, :-1]).sum()
+    # each has two more neighbours, by chance, in its row and column; single columns have as many
+    most = 2 * uniform_filter(dark.astype(float), CELL_PX).max() + MIN_CORRELATION
+    if dark.sum() < MIN_PIXELS or beside > most * dark.sum():
+        return np.zeros_like(dark)
+    return dark
 
 
 def _bias(data, variance, seen):

@@ -48,8 +48,8 @@ STRENGTHS = 1e-3, 1.0
 # Sources of which the data determine fewer parameters at every scale begin with the prior's
 # strengths, which the data hardly change. Others begin at the strengths that follow from their
 # slopes: at most N_FIRST updates of a predicted structure, until no logarithm changes by more than
-# FIRST_CHANGE, at frequencies of more than UNHEARD of the largest sharpness.
-MIN_DETERMINED, N_FIRST, FIRST_CHANGE, UNHEARD = 50.0, 30, 0.02, 1e-6
+# FIRST_CHANGE, at frequencies of more than MIN_SHARPNESS of the largest sharpness.
+MIN_DETERMINED, N_FIRST, FIRST_CHANGE, MIN_SHARPNESS = 50.0, 30, 0.02, 1e-6
 # [1] Smallest value for significant structure. Of 259 simulated galaxies, which have no structure,
 # one exceeds it, the next ones have 12 and less; bright real ones of HST and HSC have 24 to 490.
 MIN_SIGNIFICANCE = 20.0
@@ -158,11 +158,12 @@ class SourceEvidence:
         |z_j|^2 is then that of their power times alpha_j^4 k_j / (1 + b t sum_i alpha_i^2 k_i)^2.
         """
         strengths = np.array(self.prior.strengths, float)
-        if self.determined(strengths, spectrum).max() < MIN_DETERMINED:
+        is_bright = self.determined(strengths, spectrum).max() >= MIN_DETERMINED
+        if not is_bright or not np.isfinite(powers).all():  # a fit whose loss overflows ends later
             return strengths
         k, t = self.spectra.k, self.sharpness(spectrum)
-        heard = t > UNHEARD * t.max()
-        k, t, weight = k[:, heard], t[heard], self.spectra.weight[heard]
+        sharp = t > MIN_SHARPNESS * t.max()
+        k, t, weight = k[:, sharp], t[sharp], self.spectra.weight[sharp]
         noise = (k * t) @ weight * (self._levels @ self._pixels)
         both = (k * (t**2 * weight)) @ k.T * (self._levels**2 @ self._pixels)
         scatter = np.sqrt(2 * np.diagonal(both))

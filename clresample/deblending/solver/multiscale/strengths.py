@@ -139,15 +139,13 @@ class PriorStrengths:
         return found
 
     def begin(self, which, powers, spectra):
-        """First strengths of the scenes `which` (B,), see `SourceEvidence.first_strengths`.
+        """Sets the strengths of the scenes `which` (B,) by `SourceEvidence.first_strengths`.
 
         powers (S, J): |dL/dz|^2 without structure; spectra (S, C)
         """
         for s in self._free_of(np.array(which)):
             self.values[s] = self._evidence[s].first_strengths(powers[s], spectra[s])
-        self.buffers.device.upload(
-            np.ascontiguousarray(self.values**-2, self.buffers.dtype), self.precision
-        )
+        self._upload()
 
     def learn(self, due, energies, spectra):
         """New strengths of the scenes `due` (B,), from the residuals in the image buffers.
@@ -160,9 +158,7 @@ class PriorStrengths:
             given = old[s], energies[s], spectra[s], chi2[s]
             self.values[s] = self._evidence[s].learned(*given, clear=self.significant[s])
         change = self.values**-2 - old**-2
-        self.buffers.device.upload(
-            np.ascontiguousarray(self.values**-2, self.buffers.dtype), self.precision
-        )
+        self._upload()
         moved = np.zeros(len(due))
         np.maximum.at(moved, self._scene, np.abs(np.log(self.values / old)).max(1))
         loss = self._by_scene(0.5 * (energies * change).sum(1))
@@ -189,6 +185,10 @@ class PriorStrengths:
     def significant_scenes(self):
         """Selects scenes (B,) with sources whose finest structure is significant."""
         return self._by_scene(self.significant) > 0
+
+    def _upload(self):
+        precision = np.ascontiguousarray(self.values**-2, self.buffers.dtype)
+        self.buffers.device.upload(precision, self.precision)
 
     def _free_of(self, which):
         """The free sources (n,) of the scenes `which` (B,)."""
