@@ -57,10 +57,12 @@ def disagreements(images, found, fit_shifts):
     name = images[right].observation.label
     cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
     for i in np.flatnonzero(moved.any(axis=1)):
+        alone = len(np.intersect1d(found[right].sources, found[i].sources)) < 2
+        or_else = ", or the only source that shows it varies or has a neighbour" if alone else ""
         lines.append(
             f"light in {images[i].observation.label} lies away from that in {name}: by "
             f"({-moved[i, 0]:+.2f}, {-moved[i, 1]:+.2f}) +- {errors[i].max():.1g} model pixels "
-            f"(y, x); their WCS disagree; {cure}"
+            f"(y, x); their WCS disagree{or_else}; {cure}"
         )
     return (moved - moved[0] if fit_shifts and moved.any() else None), lines
 
