@@ -130,6 +130,7 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
 @lru_cache(maxsize=4)
 def model_psf(sigma_px=0.8):
     """The Gaussian of this standard deviation [model px] in model pixels."""
+    # the pixel adds its own variance, 1/12, to the Gaussian's
     radius = math.ceil(REACH * math.hypot(sigma_px, 1 / math.sqrt(12)))
     return PSF.gaussian(sigma_px, n_pixels=2 * radius + 1)
 

@@ -135,22 +135,22 @@ class MultiscaleEngine:
 
     def _queue_trial(self):
         """Queues gradients, losses and inner products at the trials."""
-        v, gradient = self.vectors, self._gradient
-        self.structure.form(v.x_new)
-        v.unpack_spectra(v.x_new)
-        gradient.queue()
-        self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
-        v.pack_gradients(gradient.rows_pull, self._row0)
+        self._queue_gradient()
+        self.vectors.pack_gradients(self._gradient.rows_pull, self._row0)
         self.steps.queue_products()
 
-    def _slope_powers(self):
-        """|dL/dz|^2 (S, J) at the trials, without structure, and the spectra (S, C) there."""
+    def _queue_gradient(self):
+        """Queues losses at the trials and their gradients, those by the structure in g_new."""
         v = self.vectors
         self.structure.form(v.x_new)
         v.unpack_spectra(v.x_new)
         self._gradient.queue()
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
-        return self._energies(v.g_new)
+
+    def _slope_powers(self):
+        """|dL/dz|^2 (S, J) at the trials, without structure, and the spectra (S, C) there."""
+        self._queue_gradient()
+        return self._energies(self.vectors.g_new)
 
     def _clear(self, asking):
         """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""
