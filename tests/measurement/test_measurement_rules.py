@@ -22,7 +22,7 @@ def test_five_sigma_and_three_percent_in_any_channel_are_a_misfit():
     residuals = np.array([[4.99, np.nan], [5.01, 0], [1, 5.01], [np.nan, np.nan], [9, 1], [9, 9]])
     light = np.array([[9, 9], [3.01, 0], [9, 3.01], [9, 9], [2.99, 9], [2.99, 3.01]])
     whole, wide = np.zeros((2, 2)), np.zeros(len(light))
-    rest = np.full(light.shape, 100.0), whole, whole, np.ones(2), wide, wide
+    rest = np.full(light.shape, 100.0), whole, whole, np.ones(2), np.full(2, np.nan), wide, wide
     none = np.full(residuals.shape, np.nan)
     found = Misfit(residuals, none, none, light, *rest)
     assert found.sources().tolist() == [False, True, True, False, False, True]
@@ -30,7 +30,7 @@ def test_five_sigma_and_three_percent_in_any_channel_are_a_misfit():
     found = Misfit(none, excess, none, light, *rest)
     assert found.sources().tolist() == [False, True, True, False, False, True]
     around = np.array([3.99, 4.01, 9, 9, 0, 0]), np.array([9, 0.0301, 0.0299, 9, 9, 9])
-    found = Misfit(none, none, none, light, *rest[:4], *around)
+    found = Misfit(none, none, none, light, *rest[:5], *around)
     assert found.sources().tolist() == [False, True, False, True, False, False]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ..component_images import image_within, window_of
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 from .cores import star_variance
 from .extended import WIDE_SIGMAS, extended_light
+from .photon_noise import photon_gains
 
 # Fraction of a source's flux in a channel from which a significant residual is a misfit. Smaller
 # residuals are within three errors of bright galaxies, which are about 1 %
@@ -48,6 +49,7 @@ class Misfit:
         pixels of the channel on the frame
     scatter (C,) [1]: of the sky's residuals, in units of the weights' noise, 1 or more; 1 of fewer
         than MIN_PIXELS of them
+    gains (C,) [1]: see `photon_gains`; NaN where chi2 is that of noise in all channels
     wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
     """
 
@@ -59,6 +61,7 @@ class Misfit:
     whole_excess: np.ndarray
     whole_chi2: np.ndarray
     scatter: np.ndarray
+    gains: np.ndarray
     wide_sigma: np.ndarray
     wide_part: np.ndarray
 
@@ -123,8 +126,11 @@ def misfit_of(result) -> Misfit:
     fields += [_observed_flux(result, remainders)]
     fields += [*(rows[-2:] for rows in own[:2])]
     fields += [np.sqrt(np.concatenate([left.noise for left in remainders]))]
-    fields += extended_light(result, remainders)
-    return Misfit(*fields)
+    fields += [np.full(len(result.channels), np.nan), *extended_light(result, remainders)]
+    misfit = Misfit(*fields)
+    if not misfit.is_unlike_noise:
+        return misfit
+    return replace(misfit, gains=photon_gains(result, remainders))
 
 
 def _of_channel(rest, c, n_sources, noise):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..posterior.residuals import remainder
+from ..inspection.pixel_noise import lag_correlation
 
 # Channels that a message names. Then the rounds of weighted least squares for 1 / gain, from a
 # variance without photon noise.
-MAX_NAMED, N_ROUNDS = 6, 6
+MAX_CHANNELS, N_ROUNDS = 6, 6
 # Photon noise over the weights' own from which pixels are bright, and the smallest number of them.
 MIN_PHOTON_NOISE, MIN_BRIGHT_PIXELS = 0.5, 100
 # chi2 per bright pixel and correlation of neighbours, photon noise included, of noise: 0.97 to 1.07
@@ -19,23 +19,32 @@ CHI2_RANGE, MAX_CORRELATION = (0.8, 1.25), 0.15
 
 def photon_noise_lines(result) -> list[str]:
     """A message if residuals are noise once the variance has the model's light over a gain."""
-    named: list[str] = []
-    for i, o in enumerate(result.observations):
-        left, weights = remainder(result, i), o.whitened.weights
-        sky = result.sky[result.channel_slices()[i], None, None]
-        light = np.maximum(o.whiten(result.model(i) - sky), 0.0) * weights
-        for c, name in enumerate(o.channels):
-            part = _missing_variance(left.residual[c] ** 2 / left.noise[c], light[c], left, c)
-            if part > 0:
-                part = part * left.noise[c] + _stated_variance(weights[c], light[c])
-                named.append(f"{1 / part:.2g} ({name})")
+    pairs = zip(result.misfit.gains, result.channels, strict=True)
+    named = [f"{gain:.2g} ({name})" for gain, name in pairs if np.isfinite(gain)]
     if not named:
         return []
     return [
         "but the noise grows with the sources' light as that of photons does, of which the weights "
         "have too little: the variance must have light / gain, with gains near "
-        f"{', '.join(named[:MAX_NAMED])}"
+        f"{', '.join(named[:MAX_CHANNELS])}"
     ]
+
+
+def photon_gains(result, remainders):
+    """Gains (C,) [1] of light whose photon noise the weights lack; NaN of channels without any.
+
+    remainders: the Remainder of each observation
+    """
+    gains = []
+    for i, (o, left) in enumerate(zip(result.observations, remainders, strict=True)):
+        weights = o.whitened.weights
+        sky = result.sky[result.channel_slices()[i], None, None]
+        light = np.maximum(o.whiten(result.model(i) - sky), 0.0) * weights
+        for c in range(len(light)):
+            part = _missing_variance(left.residual[c] ** 2 / left.noise[c], light[c], left, c)
+            stated = _stated_variance(weights[c], light[c]) if part > 0 else 0.0
+            gains.append(1 / (part * left.noise[c] + stated) if part > 0 else np.nan)
+    return np.array(gains)
 
 
 def _stated_variance(weights, light):
@@ -62,9 +71,5 @@ def _missing_variance(squares, light, left, c):
         return 0.0
     residual = left.residual[c] / np.sqrt(left.noise[c] * (1 + part * light))
     chi2 = np.square(residual[bright]).mean()
-    sums, n = 0.0, 0
-    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        both = bright[one] & bright[other]
-        sums, n = sums + (residual[one] * residual[other])[both].sum(), n + both.sum()
-    is_noise = CHI2_RANGE[0] < chi2 < CHI2_RANGE[1] and abs(sums) < MAX_CORRELATION * chi2 * n
-    return part if is_noise else 0.0
+    is_white = abs(lag_correlation(residual, bright, 1)) < MAX_CORRELATION
+    return part if CHI2_RANGE[0] < chi2 < CHI2_RANGE[1] and is_white else 0.0

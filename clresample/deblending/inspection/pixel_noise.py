@@ -109,11 +109,9 @@ def _scatter(values):
 
 def _correlation(values, pixels):
     """Correlation of neighbouring pixels (My, Mx), less that at FAR_PX, which smooth light has."""
-    middle = np.median(values[pixels])
-    away = np.abs(values - middle)
-    kept = pixels & (away < CLIP * SIGMAS_A_MAD * np.median(away[pixels]))
-    deviations = np.where(kept, values - middle, 0)
-    return _at(1, deviations, kept) - _at(FAR_PX, deviations, kept)
+    deviations = values - np.median(values[pixels])
+    kept = _without_outliers(deviations, pixels)
+    return lag_correlation(deviations, kept, 1) - lag_correlation(deviations, kept, FAR_PX)
 
 
 def _is_white(values, pixels):
@@ -126,13 +124,19 @@ def _is_white(values, pixels):
         whole = whole[low] & whole[middle] & whole[high]
     if not whole.any():
         return False
-    away = np.abs(differences)
-    kept = whole & (away < CLIP * SIGMAS_A_MAD * np.median(away[whole]))
-    return _at(1, np.where(kept, differences, 0), kept) < WHITE_DIFFERENCES
+    kept = _without_outliers(differences, whole)
+    return lag_correlation(differences, kept, 1) < WHITE_DIFFERENCES
 
 
-def _at(lag, deviations, kept):
+def _without_outliers(deviations, pixels):
+    """Selects those of the pixels (My, Mx) that deviate by less than CLIP."""
+    away = np.abs(deviations)
+    return pixels & (away < CLIP * SIGMAS_A_MAD * np.median(away[pixels]))
+
+
+def lag_correlation(deviations, kept, lag):
     """Correlation of deviations (My, Mx) with those `lag` pixels away, of the pixels kept alone."""
+    deviations = np.where(kept, deviations, 0)
     power = np.vdot(deviations, deviations) / max(np.count_nonzero(kept), 1)
     both, sums = 0, 0.0
     for one, other in ((np.s_[lag:], np.s_[:-lag]), (np.s_[:, lag:], np.s_[:, :-lag])):

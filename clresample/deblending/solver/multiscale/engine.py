@@ -62,8 +62,9 @@ class MultiscaleEngine:
             v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
             spectra = np.concatenate([s.spectra for s in states])
-            if any(s.learned is None for s in states):
-                self.strengths.begin([s.learned is None for s in states], *self._slope_powers())
+            new = np.array([s.learned is None for s in states])
+            if new.any():
+                self.strengths.begin(new, *self._slope_powers())
             self.strengths.request_blocks(spectra, self.progress.n_rounds)
             self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
             self._exchanges = [[] for _ in scenes]

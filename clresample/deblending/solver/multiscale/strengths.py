@@ -143,7 +143,7 @@ class PriorStrengths:
 
         powers (S, J): |dL/dz|^2 without structure; spectra (S, C)
         """
-        for s in self._free_of(np.array(which)):
+        for s in self._free_of(which):
             self.values[s] = self._evidence[s].first_strengths(powers[s], spectra[s])
         self._upload()
 
