@@ -149,6 +149,11 @@ class InspectedImage:
         """FWHM [px] of the PSF, the median of the channels'."""
         return float(np.median(self.observation.psf.fwhm_px))
 
+    @property
+    def width_arcsec(self) -> float:
+        """FWHM [arcsec] of the PSF."""
+        return self.width_px * self.observation.grid.pixel_scale_arcsec
+
     def in_model(self, points) -> np.ndarray:
         """Points (..., 2) [px] of the image in model pixels."""
         return (points - self.offset) @ np.linalg.inv(self.matrix).T

@@ -18,8 +18,8 @@ from .levels import SkyLevel, sky_level
 from .matched_widths import width_lines
 from .noisy_variance import prepared
 from .pixel_noise import noise_lines
-from .star_psfs import replace_by_stars, with_star_psfs
-from .stars import misfitting_widths
+from .star_psfs import may_be_star, replace_by_stars, with_star_psfs
+from .stars import misfitting_widths, points
 from .tilt import tilt_lines
 
 # A sky level is reported as left in or over-subtracted above this many of its errors, and above
@@ -132,7 +132,9 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
     n_wide, n_own, n_all = n_channels
-    stars, still = near[n_wide > 0], near[(n_own > 0) & (n_own == n_all)]
+    may_be_stars = np.array([may_be_star(source) for source in sources], bool)
+    is_point = points(images, settings.psf_error) & may_be_stars
+    stars, still = near[(n_wide > 0) | is_point], near[(n_own > 0) & (n_own == n_all)]
     if len(stars):
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:

@@ -78,9 +78,7 @@ def significant(shift, error, least=MIN_SHIFT_PX, sigmas=SHIFT_SIGMAS):
 
 def sharpest(images) -> int:
     """Selects the image with the narrowest PSF on the sky."""
-    areas = [max(abs(np.linalg.det(image.matrix)), 1e-30) for image in images]  # [px / model px]
-    widths = [image.width_px / area**0.5 for image, area in zip(images, areas, strict=True)]
-    return int(np.argmin(widths))
+    return int(np.argmin([image.width_arcsec for image in images]))
 
 
 def _between(one, its, other, theirs):

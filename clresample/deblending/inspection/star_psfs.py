@@ -121,7 +121,7 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
     sources: those of `image.places`; sky, sky_beside_wide: True if a sky level is fitted,
         without and with wide cores
     """
-    stars = [i for i, source in enumerate(sources) if _may_be_star(source) and image.inside[i]]
+    stars = [i for i, source in enumerate(sources) if may_be_star(source) and image.inside[i]]
     found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
     if not stars or image.usable.all():
         return image, n_wide, n_own
@@ -175,7 +175,7 @@ def replace_by_stars(sources, numbers, still):
     return tuple(found)
 
 
-def _may_be_star(source):
+def may_be_star(source):
     """Returns True if a source is a star, or has no property but its position."""
     if isinstance(source, PointSource):
         return True

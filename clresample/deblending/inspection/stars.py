@@ -1,6 +1,8 @@
-"""Width of the sources in an observation against its PSF."""
+"""Width of the sources in an observation against its PSF: wrong PSFs, and stars."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,9 +24,50 @@ MIN_USABLE = 0.75
 MAX_STARS = 3
 # [1], [px] Steps of the slopes by width and by position: small against the PSF's core.
 WIDTH_STEP, SHIFT_STEP = 0.05, 0.1
+# [sigma] Light of a source, in one channel, that is a star if it looks like its PSF: a galaxy as
+# bright is far wider. Under a PSF of 1.6 or 2 px no galaxy profile is as sharp as a star on pixels
+# of the model, and stars of signal to noise 1200, photon noise included, ended as misfits.
+POINT_SIGMAS = 100.0
+# [its error] Largest level about such a star: more is of a host or a neighbour.
+MAX_LEVEL_SIGMAS = 5.0
 # Rounds in which the PSF is moved to the light, and [px] its largest move in one: a star 1 px from
 # its place under a PSF of 2.3 px FWHM was named 15 % wider than it.
 MAX_ROUNDS, MAX_MOVE_PX = 6, 0.7
+
+
+class Width(NamedTuple):
+    """A source's light in one channel, as a moved PSF of another width on a level.
+
+    part [1]: relative excess of the light's width over the PSF's, negative if it is narrower;
+        error: of it, infinite where it cannot be measured
+    sigmas: of the light; level: over its error
+    rest [1]: norm of the remaining light, beyond the noise's, over that of all
+    """
+
+    channel: int
+    part: float = 0.0
+    error: float = np.inf
+    sigmas: float = 0.0
+    level: float = 0.0
+    rest: float = 0.0
+
+
+def points(images, psf_error):
+    """Selects sources (S,) that look like the PSF: stars, whatever they are listed as.
+
+    By the sharpest of InspectedImages that shows POINT_SIGMAS of their light. psf_error [1]: of the
+    PSF's width, see Settings
+    """
+    found, seen = np.zeros((2, len(images[0].places)), bool)
+    for image in sorted(images, key=lambda one: one.width_arcsec):
+        for i in image.brightest[image.light[image.brightest] > POINT_SIGMAS]:
+            w = _width(image, i)
+            if seen[i] or w.sigmas < POINT_SIGMAS:
+                continue
+            unlike = max(abs(w.part) - WIDTH_SIGMAS * w.error, w.rest)
+            found[i] = unlike <= psf_error and abs(w.level) <= MAX_LEVEL_SIGMAS
+            seen[i] = True
+    return found
 
 
 def misfitting_widths(image, sources):
@@ -42,7 +85,7 @@ def misfitting_widths(image, sources):
         star = stars[i]
         if star and not _alone(image, i):
             continue
-        c, part, error = _width(image, i)
+        c, part, error, *_ = _width(image, i)
         if abs(part) < max(WIDTH_PART, WIDTH_SIGMAS * error) or (part > 0 and not star):
             continue
         found.append((int(i), c, part, error))
@@ -58,11 +101,11 @@ def _alone(image, i):
 
 
 def _width(image, i):
-    """Channel of most light of source i, its width against the PSF's (1 + part), and the error.
+    """The Width of source i in its channel of most light.
 
         d = b + a P(x - p) - a t . grad P + a part dP/dpart,   P wider by part: P(x / (1 + part))
 
-    by least squares with the weights of the pixels; 0 and infinity where it cannot be measured.
+    by least squares with the weights of the pixels.
     """
     reach = int(np.ceil(REACH_FWHM * image.width_px)) + 1
     y, x, on = image.patches(np.array([i]), reach)
@@ -73,7 +116,7 @@ def _width(image, i):
     place = image.places[i]
     core = np.hypot(y - place[0], x - place[1]) <= image.width_px
     if not good[core].all() or good.mean() < MIN_USABLE:
-        return c, 0.0, np.inf
+        return Width(c)
     root = np.where(good, np.sqrt(image.observation.weights[c, y, x]), 0).ravel() * image.sigma[c]
     z = np.where(good, light[c], 0).ravel().astype(float)
     for _ in range(MAX_ROUNDS):
@@ -81,16 +124,24 @@ def _width(image, i):
         design = _columns(image.observation.psf, c, *away) * root
         inverse = np.linalg.pinv(design @ design.T)
         found = inverse @ (design @ z)
-        if not found[1] * np.sqrt((design[1] ** 2).sum()) > STAR_SIGMAS:
+        sigmas = found[1] * np.sqrt((design[1] ** 2).sum())
+        if not sigmas > STAR_SIGMAS:
             break
         shift = -found[2:4] / found[1]
         if np.abs(shift).max() < SHIFT_STEP:
-            rest = z - found @ design
-            spread = max(1.0, float(rest @ rest) / (good.sum() - len(found)))
-            part = found[4] / found[1]
-            return c, float(part), float(np.sqrt(inverse[4, 4] * spread) / found[1])
+            rest, n_free = z - found @ design, good.sum() - len(found)
+            spread = max(1.0, float(rest @ rest) / n_free)
+            error = np.sqrt(np.diagonal(inverse) * spread)
+            return Width(
+                channel=c,
+                part=found[4] / found[1],
+                error=error[4] / found[1],
+                sigmas=sigmas,
+                level=found[0] / error[0],
+                rest=np.sqrt((spread - 1) * n_free) / sigmas,
+            )
         place = place + np.clip(shift, -MAX_MOVE_PX, MAX_MOVE_PX)
-    return c, 0.0, np.inf
+    return Width(c)
 
 
 def _columns(psf, c, dy, dx):
