@@ -55,6 +55,27 @@ def test_each_of_two_galaxies_has_its_own_light(device, spoilt, size):
     assert spoilt[0].moves.all()
 
 
+@pytest.mark.parametrize("n_ends", [4, 3])
+def test_a_compact_galaxy_in_a_wide_one_gives_its_light_back(device, monkeypatch, n_ends):
+    """It had grown to the wide one's size, with a cusp of its own light, and stays so without the
+    exchange of both profiles."""
+
+    def run(fit):
+        fit.theta[0] = SMALL, (np.log(9.0), 0, 0, np.log(0.5))
+        fit._take(SCENES)
+        run_from_equal_profiles(fit, SCENES)
+
+    monkeypatch.setattr(ProfileFit, "run", run)
+    monkeypatch.setattr(close_pairs, "N_ENDS", n_ends)
+    wide, compact = tuple(0.02 * FLUX), tuple(0.008 * FLUX)
+    b = blend([((39, 40), wide, 12.0), ((41.5, 41), compact, 1.5)], shape=(80, 82), seed=1)
+    one = Fit(b, Settings(), device, np.float32, pad=1)
+    start_fits([one])
+    sizes = np.array([theta[0] for theta in one.start.thetas])
+    is_right = np.abs(sizes - np.log([12.0, 1.5])).max() < 0.1
+    assert is_right == (n_ends == close_pairs.N_ENDS == 4)
+
+
 def test_errors_hold_divisions_of_light_that_are_not_excluded(device, spoilt, monkeypatch):
     """One of two faint galaxies may have gained light of the other, by the doubt of the start."""
     (known,) = deblend_many([pair(0.005)], device=device)
@@ -101,9 +122,10 @@ def test_pairs_have_ends_of_their_own(device, monkeypatch):
     start_fits([Fit(blend(rows, shape=(88, 88), seed=6), Settings(), device, np.float32, pad=1)])
     (alone, both), ((size, _), (other, _)) = doubts, np.array(sizes)[:, :2]
     assert abs(size - np.log(6)) > 0.2 > abs(other - np.log(6))  # only where it is a pair
-    np.testing.assert_allclose(both[2:, :, 3:], alone[2:], atol=1e-3 * np.abs(alone).max())
-    assert both[:2, :, :3].any() and alone[2:].any()
-    assert not both[:2, :, 3:].any() and not both[2:, :, :3].any() and not alone[:2].any()
+    n = close_pairs.N_ENDS
+    np.testing.assert_allclose(both[2:, :, n:], alone[2:], atol=1e-3 * np.abs(alone).max())
+    assert both[:2, :, :n].any() and alone[2:].any()
+    assert not both[:2, :, n:].any() and not both[2:, :, :n].any() and not alone[:2].any()
 
 
 def test_a_window_of_a_scene_with_held_light(device, spoilt):

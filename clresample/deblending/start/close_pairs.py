@@ -4,10 +4,12 @@ Two galaxies that grow from small profiles at nearly one place compete for the s
 grow to the size of both, while the other stays as small as it began. Chi2 has a minimum there, and
 often a deeper one where each has its own light, or one where they have exchanged their light. To
 reach them, each pair is fitted again, without doubt of either shape, from the larger one's profile
-at both places: both of them together, and with the smaller one's profile held there. All other
-light stays as it is, so that pairs do not decide for one another. Scenes of which a pair has a
-better end are fitted once more from there. Profiles are wrong by more than noise, so that errors of
-the fluxes f hold the changes to the other ends, whose chi2 is worse by Delta (posterior.py):
+at both places, both of them together and with the smaller one's profile held there, and from the
+two profiles exchanged: a compact galaxy within a wide one may have grown to the size of that, with
+a cusp of its own light. All other light stays as it is, so that pairs do not decide for one
+another. Scenes of which a pair has a better end are fitted once more from there. Profiles are wrong
+by more than noise, so that errors of the fluxes f hold the changes to the other ends, whose chi2 is
+worse by Delta (posterior.py):
 
     scatter = sqrt(w) (f_other - f),    w = 1 / (1 + exp(Delta / NEED))
 
@@ -27,7 +29,7 @@ from .shape_grid import part_inside
 # smallest ratio of the two radii. Of 120 galaxies in pairs none is silently wrong (bench.ladder,
 # close, seed 52525); of 200 without further starts 18 are.
 MAX_AWAY, MIN_RATIO = 1.1, 1.5
-N_ENDS = 3  # before, of both profiles, with one of them held
+N_ENDS = 4  # before, of both profiles, with one of them held, with both exchanged
 # Side of the windows in which pairs are fitted, in that of their light before, which may widen.
 MARGIN = 1.5
 BYTES_A_PIXEL = 20  # of root, data, light, residual and weight
@@ -42,7 +44,7 @@ def run_from_equal_profiles(fit, scenes):
     if not groups:
         return
     scenes = np.unique([fit.looking.scene[min(own)] for own in groups])
-    before, chi2, moved = fit._copy(), fit._chi2_as_expected(scenes), []
+    before, chi2, moved = fit._copy(), fit.chi2_as_expected(scenes), []
     fit._look(scenes, fit.theta, slopes=False)
     rest = fit.looking.without_light(fit.looking.spectra)
     windows = [_windows(fit.looking, sight, groups) for sight in rest.sights]
@@ -56,7 +58,7 @@ def run_from_equal_profiles(fit, scenes):
     again = np.unique(fit.looking.scene[moved])
     fit._take(again, doubt=False)
     fit._step(again)
-    better = fit._chi2_as_expected(scenes) < chi2
+    better = fit.chi2_as_expected(scenes) < chi2
     fit._undo(before, np.intersect1d(again, scenes[~better]))
 
 
@@ -83,11 +85,13 @@ def _best_ends(fit, rest, groups, windows, first):
     at = np.reshape(part.at, (2, N_ENDS, n_all))
     small = np.array([i in groups[g] for g, i in members])
     larger = np.array([members.index((g, groups[g][i])) for g, i in members if i in groups[g]])
+    own = part.theta[*at[:, -1, small]]
     part.theta[*at[:, 1:, small]] = part.theta[*at[:, 1:, larger]]
-    part.moves[*at[:, -1, small]] = False
+    part.theta[*at[:, -1, larger]] = own
+    part.moves[*at[:, 2, small]] = False
     part._take(every, doubt=False)
     part._step(every[len(groups) :])
-    chi2 = part._chi2_as_expected(every).reshape(N_ENDS, -1)
+    chi2 = part.chi2_as_expected(every).reshape(N_ENDS, -1)
     theta, spectra = part.theta[*at], part.looking.spectra.reshape(N_ENDS, n_all, -1)
     inside = part_inside(looking.components, theta.reshape(N_ENDS * n_all, -1))
     flux = spectra * inside.reshape(N_ENDS, n_all, 1)

@@ -189,7 +189,7 @@ class ProfileFit:
         """With the priors (k,)."""
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
-    def _chi2_as_expected(self, scenes):
+    def chi2_as_expected(self, scenes):
         """Chi2 (k,) with the priors as they were before any scene was fitted."""
         learned = self.population.penalty(scenes, self.theta)
         return self.chi2[scenes] - learned + self.expected.penalty(scenes, self.theta)
@@ -284,7 +284,7 @@ def _run_from_large_galaxies(fit, scenes):
     The better fit of each stays. Scenes in which no larger profile has more of the light keep the
     first one, which goes on with less doubt where it was ended because a galaxy had grown.
     """
-    before, chi2 = fit._copy(), fit._chi2_as_expected(scenes)
+    before, chi2 = fit._copy(), fit.chi2_as_expected(scenes)
     grown = _have_grown(fit)[scenes]
     fit.theta[scenes] = fit.expected.mean[scenes]
     fit.population.reset(scenes, fit.expected)
@@ -293,7 +293,7 @@ def _run_from_large_galaxies(fit, scenes):
     fit.looking.solve(MODEL_ERROR)
     some = first_profiles(fit, scenes, MODEL_ERROR)[scenes].any(axis=1)
     _go_on_with_less_doubt(fit, scenes[some])
-    better = some & (fit._chi2_as_expected(scenes) < chi2)
+    better = some & (fit.chi2_as_expected(scenes) < chi2)
     fit._restore(before, scenes[~better])
     _go_on_with_less_doubt(fit, scenes[~better & (some | grown)])
 
