@@ -176,6 +176,9 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
     best, other = first_scene.best_starts([starts, others], True)
     assert best is starts[1] and other is others[2]
     assert (best.state.spectra == 1).all() and (best.state.sky == -1).all()
+    n_kept = np.array([[0.0, 2, 0], [0, 0, 4]])  # structure that the best ones keep
+    best, other = first_scene.best_starts([starts, others], True, n_kept)
+    assert best is starts[2] and other is others[0]
 
 
 def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
@@ -186,7 +189,10 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
 
     asked = [None, clear(1), clear(), clear(0, 2)]
     settings, tols = SimpleNamespace(fit_sky=True, start_tol=25.0), []
-    fits = [SimpleNamespace(name=i, start=[i] * 3, settings=settings) for i in range(4)]
+    found = SimpleNamespace(n_effective=np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
+    given = {"settings": settings, "strength_estimates": found}
+    fits = [SimpleNamespace(name=i, start=[i] * 3, **given) for i in range(4)]
+    kept = []
     monkeypatch.setattr(second, "run_gradient_tests", lambda fits: asked)
     monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
     monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
@@ -206,8 +212,11 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
         "_going_on",
         lambda state, first, before, new: (first.name, before.tolist(), new.tolist()),
     )
-    monkeypatch.setattr(second, "best_starts", lambda starts, fit_sky: starts)
+    monkeypatch.setattr(
+        second, "best_starts", lambda starts, fit_sky, n_kept: kept.append(n_kept) or starts
+    )
     begun = second.start_refits(fits)
+    np.testing.assert_array_equal(kept[0], [[3 + 11, 0, 21], [7, 0, 21]])  # structure that is kept
     assert {i: [(one.point, one.state) for one in three] for i, three in begun.items()} == {
         1: [
             ("alone 1 in 1", (1, [0, 1, 1, 2], [False, True, True, False])),

@@ -1,4 +1,4 @@
-"""Starting models of two-component fits: of three candidates the one with the lowest chi2.
+"""Starting models of two-component fits: the best one of three candidates.
 
 For a bulge with a disc, smooth profiles of two components are the best start. In a merger they
 would lose most of the fitted structure: there the fitted component is kept, and a core is added to
@@ -29,7 +29,7 @@ CORE = 0.5**0.5
 def start_refits(fits):
     """{index: a Fit at its start} of the scenes with sources that clearly need two components.
 
-    Of three starts the one that fits the data best where it begins, with the best spectra:
+    Of three starts the best one where it begins, with the best spectra, see `best_starts`:
     known   all other components from the first fit, with structure and strengths, and smooth
             profiles of the two components, fitted to the rest of the data: the neighbours' models
             are good, but their structure may contain light of the component in question
@@ -48,7 +48,7 @@ def start_refits(fits):
     alone = fit_start_profiles([_alone(fits[i], one) for i, one in asked.items()], tol=tol)
     patches = [_together(fits[i], one.significant) for i, one in asked.items()]
     together = fit_start_profiles(patches, fit_sky=fit_sky, tol=tol)
-    starts = []
+    starts, n_kept = [], []
     for (i, one), own, all_smooth in zip(asked.items(), alone, together, strict=True):
         first = fits[i]
         known = _again(first, _joined(first.start, own, one.significant))
@@ -57,7 +57,10 @@ def start_refits(fits):
         beside = _again(first, _with_cores(first, one))
         beside.state = _going_on(beside.state, first, *_cores(len(first.start), one.significant))
         starts.append((known, whole, beside))
-    return dict(zip(asked, best_starts(starts, fit_sky), strict=True))
+        determined = first.strength_estimates.n_effective.sum(axis=1)
+        others = np.delete(determined, one.significant)
+        n_kept.append([others.sum(), 0.0, determined.sum()])
+    return dict(zip(asked, best_starts(starts, fit_sky, np.array(n_kept)), strict=True))
 
 
 def _again(fit, point):
@@ -84,8 +87,10 @@ def _together(fit, chosen):
         thetas[i] = [begin.thetas[k] for k in own]
         if own[0] in chosen:
             sources[i], thetas[i] = replace(source, n_components=2), _split(*thetas[i])
-        elif len(own) == 1 and isinstance(begin.shapes[own[0]], GalaxyProfile):
-            profile = begin.drawn(own[0], (0, 0), fit.frame.shape)
+        elif len(own) > 1:
+            sources[i] = replace(source, n_components=len(own))
+        elif isinstance(begin.shapes[own[0]], GalaxyProfile):
+            profile = np.maximum(begin.drawn(own[0], (0, 0), fit.frame.shape), 0)  # rounding
             sources[i] = replace(source, profile=profile, n_components=None)
     return replace(fit.patch, sources=sources, thetas=thetas)
 

@@ -44,15 +44,17 @@ def first_scene(fit) -> tuple[Scene, State]:
     return scene, State([m.copy() for m in morphs], begin.spectra, begin.sky)
 
 
-def best_starts(starts, fit_sky):
-    """Selects of each scene's Fits at their starts the one with the lowest chi2.
+def best_starts(starts, fit_sky, n_kept=0):
+    """Selects of each scene's Fits at their starts the one with the lowest chi2 + 2 n_kept.
 
     All scenes have equally many starts, compared with their best spectra and sky.
+    n_kept (scenes, starts): parameters of their structure that the data determined, which lower
+        chi2 as much if they are noise (Akaike 1974, IEEE Trans. Autom. Control 19, 716)
     """
     fits = [fit for of_scene in starts for fit in of_scene]
     solved, chi2 = solve_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
     for fit, (spectra, sky, own) in zip(fits, solved, strict=True):
         chi2.append(own)
         fit.state = replace(fit.state, spectra=spectra, sky=sky)
-    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
+    best = (np.reshape(chi2, (len(starts), -1)) + 2 * n_kept).argmin(axis=1)
     return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
