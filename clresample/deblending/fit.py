@@ -212,7 +212,8 @@ def start_fits(fits):
     for fit in fits:
         fit.forget_start()
     settings, patches = fits[0].settings, [fit.patch for fit in fits]
-    points = fit_start_profiles(patches, fit_sky=settings.fit_sky, tol=settings.start_tol)
+    given = {"fit_sky": settings.fit_sky, "tol": settings.start_tol}
+    points = fit_start_profiles(patches, **given, second=settings.adds_components)
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
         fit.begin(point, seconds)

@@ -44,6 +44,11 @@ class FitSettings:
         """Gain in chi2 below which steps of the smooth profiles at the start end."""
         return CHI2_TOL
 
+    @property
+    def adds_components(self) -> bool:
+        """True if data choose the number of a galaxy's components where it is not given."""
+        return False
+
     def start_run(self, fits, device, dtype, takes_over=None):
         """The run of Fits of one signature that have begun, as `iterate` drives it.
 
@@ -127,6 +132,11 @@ class Settings(FitSettings):
     def start_tol(self) -> float:
         """See `FitSettings.start_tol`; larger where `loss_tol` is larger than the default."""
         return max(CHI2_TOL, CHI2_TOL * self.loss_tol / Settings.loss_tol)
+
+    @property
+    def adds_components(self) -> bool:
+        """See `FitSettings.adds_components`."""
+        return True
 
     def start_run(self, fits, device, dtype, takes_over=None) -> LbfgsRun:
         """See `FitSettings.start_run`."""

@@ -143,7 +143,8 @@ class ExtendedSource(Source):
     For the position see `Source`.
 
     n_components: None = one, or two if the galaxy's core differs significantly in colour from the
-        rest, which only fits with a MultiscalePrior test
+        rest, or lies in light that is far wider, which only fits with a MultiscalePrior test. A
+        source that looks like the PSF is fitted as a PointSource, unless this or a profile is given
     profile (Ny, Nx) [1]: expected image of its only morphology under the model's PSF, on the
         frame's pixels, non-negative; None = a smooth profile fitted to the data
     """

@@ -148,14 +148,14 @@ def test_a_first_start_that_wins_goes_on_with_less_doubt(sized, monkeypatch):
 
 def test_profiles_do_not_depend_on_the_other_scenes(device, monkeypatch):
     """With a fitted sky: a giant alone, and beside a scene with a star, which is modelled first."""
-    gains, products = [], first_profiles_module._products
+    gains, products = [], first_profiles_module.products_beside
 
     def noted(*args):
         around, right, *rest = products(*args)
         gains.append(right[around.scene == around.n_scenes - 1])
         return around, right, *rest
 
-    monkeypatch.setattr(first_profiles_module, "_products", noted)
+    monkeypatch.setattr(first_profiles_module, "products_beside", noted)
 
     def fit_of(objects):
         one = blend(objects, shape=(96, 96), seed=5)

@@ -139,13 +139,13 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
     monkeypatch.setattr(
         room,
         "fit_start_profiles",
-        lambda patches, fit_sky, tol: [p + fit_sky + tol for p in patches],
+        lambda patches, fit_sky, tol, second: [p + fit_sky + tol + second for p in patches],
     )
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     fits = [
         SimpleNamespace(
             patch=k,
-            settings=SimpleNamespace(fit_sky=100, start_tol=1000),
+            settings=SimpleNamespace(fit_sky=100, start_tol=1000, adds_components=1e4),
             forget_start=lambda: None,
             begin=lambda *given: asked.append(given),
             blend=SimpleNamespace(structures=(k,) * k),
@@ -154,7 +154,7 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
     ]
     monkeypatch.setattr(room, "carry_structure", asked.append)
     room.start_fits(fits)
-    assert asked == [(1100, 2.0), (1101, 2.0), (1102, 2.0), fits[1:]]
+    assert asked == [(11100, 2.0), (11101, 2.0), (11102, 2.0), fits[1:]]
 
 
 def test_memory_of_a_fit_holds_what_its_solver_takes():

@@ -76,11 +76,12 @@ def _candidates(fit):
     if fit.strength_estimates is None or not np.isfinite(fit.losses[-1:]).all():
         return np.zeros(0, int)
     source = fit.fitted[fit.start.source]
-    free = [_is_free(fit.blend.sources[i]) for i in source]
+    single = np.bincount(fit.start.source)[fit.start.source] == 1
+    free = [_is_free(fit.blend.sources[i]) for i in source] & single
     snr = np.sqrt((fit.state.spectra**2 * fit.scene.spectrum_curvature).sum(1))
     seen = (fit.state.spectra > 0) & (fit.scene.spectrum_curvature > 0)
     seen_in = (seen if fit.ties is None else fit.ties.total(seen) > 0).sum(1)
-    return np.flatnonzero(np.array(free, bool) & (snr > MIN_SNR) & (seen_in > 1))
+    return np.flatnonzero(free & (snr > MIN_SNR) & (seen_in > 1))
 
 
 def _is_free(source):

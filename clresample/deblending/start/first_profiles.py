@@ -129,7 +129,7 @@ def _next(looking, models, rest, error):
     """
     listed = [(i, theta) for i, own in rest.items() for theta in own]
     component = np.array([i for i, _ in listed])
-    around, right, light, alone = _products(looking, models, listed, error)
+    around, right, light, alone = products_beside(looking, models, listed, error)
     noise = alone + (NEIGHBOUR_MODEL_ERROR * (light - right)) ** 2
     square = np.maximum(right, 0) ** 2
     gain = np.divide(square, noise, out=np.zeros_like(noise), where=alone > 0).sum(axis=1)
@@ -141,7 +141,7 @@ def _next(looking, models, rest, error):
     return dict(_apart(around, listed, gain, at))
 
 
-def _products(looking, models, listed, error):
+def products_beside(looking, models, listed, error):
     """LinearisedScenes of components [(i, theta)], and three products (n, C) of their images.
 
     With the data minus the models {component: theta}, with the data, and with themselves.

@@ -23,14 +23,16 @@ import numpy as np
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
-from ...sky.sources import PointSource
+from ...sky.sources import ExtendedSource, PointSource
 from ..linear.component_batch import StartComponent, renumbered
 from ..linear.linearised_scenes import linearise
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..sampled_psf import sampled_psfs
 from ..view import WhitenedView, pixel_noise
+from .first_profiles import NEED
 from .profile_fit import CHI2_TOL, ProfileFit, start_from
 from .star_weights import allow_for_psf_error
+from .wide_light import wide_profiles
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -112,13 +114,28 @@ class StartingPoint:
 
 
 def fit_start_profiles(
-    patches: list[StartInput], *, fit_sky=False, tol=CHI2_TOL
+    patches: list[StartInput], *, fit_sky=False, tol=CHI2_TOL, second=False
 ) -> list[StartingPoint]:
     """Fits profiles and free stars of all patches side by side; see the module's text.
 
     patches: of equal numbers of observations, these of equal shapes
     fit_sky: also a level per channel; tol: see ProfileFit
+    second: give galaxies in light that is far wider a second component, see wide_light.py
     """
+    fit, points = _fitted(patches, fit_sky, tol)
+    wider = _with_wide_light(patches, fit, points) if second else {}
+    if wider:
+        again, others = _fitted(list(wider.values()), fit_sky, tol)
+        chi2, scenes = fit.chi2_as_expected(list(wider)), np.arange(len(wider))
+        better = again.chi2_as_expected(scenes) < chi2 - NEED
+        for b, point, gained in zip(wider, others, better, strict=True):
+            if gained:
+                points[b] = replace(point, undetected=points[b].undetected)
+    return points
+
+
+def _fitted(patches, fit_sky, tol):
+    """The ProfileFit of patches that has ended, and its StartingPoints."""
     sources, components = _components(patches)
     views = [p.views for p in patches]
     looking = linearise(views, components, PRECISION, TOLERANCE, fit_sky=fit_sky)
@@ -131,7 +148,33 @@ def fit_start_profiles(
     thetas = fit.thetas()
     looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
-    return [_point(patch, fit, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
+    return fit, [_point(patch, fit, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
+
+
+def _with_wide_light(patches, fit, points):
+    """{scene: its StartInput with second components} of a ProfileFit, see wide_light.py."""
+    components = fit.looking.components
+    free = [_may_have_two(patches[c.scene].sources[c.source], c.shape) for c in components]
+    found = wide_profiles(fit, np.array(free))
+    inputs = {}
+    for b in sorted({components[i].scene for i in found}):
+        begin, sources = points[b], list(patches[b].sources)
+        thetas: list = [[] for _ in sources]
+        for i, theta in zip(begin.source, begin.thetas, strict=True):
+            thetas[i].append(theta)
+        for i, wide in found.items():
+            if components[i].scene == b:
+                own = components[i].source
+                sources[own] = replace(sources[own], n_components=2)
+                thetas[own].append(wide)
+        inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas))
+    return inputs
+
+
+def _may_have_two(source, shape):
+    """Returns True if the data choose the number of a source's components, of which it has one."""
+    is_galaxy = isinstance(source, ExtendedSource) and isinstance(shape, GalaxyProfile)
+    return is_galaxy and source.n_components is None
 
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
