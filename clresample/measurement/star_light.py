@@ -28,8 +28,9 @@ from scipy.ndimage import (
 )
 
 from ..deblending.inspection.image import brightness, typical_sigma
+from ..deblending.inspection.psf_samples import ring_mean
 from ..deblending.inspection.spoilt import saturated_pixels
-from ..deblending.inspection.star_cores import star_cores
+from ..deblending.inspection.star_cores import MAX_FLATTER, star_cores
 from ..deblending.inspection.star_profile import RadialProfile
 from ..sky.psf import SIGMAS_A_FWHM
 from .signal_to_noise import WIDTHS_ARCSEC, SignalToNoise
@@ -55,6 +56,8 @@ MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 MIN_CORE_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
 SAME_STAR_FWHM = 1.0
+# [sigma] Smallest light, in another channel, of a star that is saturated in one.
+MIN_POINT_SIGMAS = 10.0
 # Median |x| of a unit Gaussian, inverted.
 SIGMAS_A_MAD = 1.4826
 
@@ -81,9 +84,30 @@ def saturated_stars(observations, frame) -> list[StarPlace]:
         scale = o.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
         for c, fwhm in enumerate(o.psf.fwhm_px):
             for core in star_cores(light[c], usable[c], o.psf, c):
+                if _is_gap(light, usable, o.psf, c, core):
+                    continue
                 place = o.grid.positions_in(frame.grid, *core.place)
                 found.append((core.light, fwhm * scale, StarPlace(place, core.radius * scale)))
     return _merged(found)
+
+
+def _is_gap(light, usable, psf, c, core):
+    """Returns True if a core of channel c is a gap over a galaxy, or over nothing.
+
+    By the brightest other channel in which all of it is seen: there a star is a point.
+    light, usable (C, My, Mx): of all channels, see `star_cores`
+    """
+    away = np.hypot(*(np.indices(light.shape[1:]) - core.place[:, None, None]))
+    radius = max(core.radius, float(psf.fwhm_px.max()))
+    ring, disc = np.abs(away - radius) < 1, away < radius + 1
+    middle = away < max(1.0, away.min() + 0.5)
+    others = [k for k in range(len(light)) if k != c and usable[k][disc].all()]
+    if not others:
+        return False
+    peak, k = max((float(light[k][middle].max()), k) for k in others)
+    top = max(ring_mean(psf, k, r) for r in (0.0, 0.5))
+    point = peak * max(ring_mean(psf, k, radius), 0.0) / top
+    return peak < MIN_POINT_SIGMAS or float(np.median(light[k][ring])) > MAX_FLATTER * point + 1
 
 
 def _merged(found):
