@@ -37,6 +37,9 @@ CLUMP_ARCSEC = 0.8
 # [sigma^2] Smallest excess of chi2 between a residual's spectrum and the galaxy's; and the relative
 # error of the galaxy's model in each channel.
 OTHER_COLOUR, MODEL_PART = 8.0, 0.1
+# The same of a peak that only its colour tells from structure, in images of less resolution. With 8
+# there are 2 more false sources among 514 of simulated fields, and no more true ones.
+CLEAR_COLOUR = 25.0
 # [1] of the galaxy's light in the searched image: residual of a smooth, symmetric galaxy
 ASYMMETRY = 0.05
 # [sigma] Smallest height of a peak, and its height under the filter of small galaxies. They are
@@ -127,7 +130,7 @@ def local_level(rest, place, radius):
     return max(float(np.median(window)), 0.0)
 
 
-def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
+def is_a_source(place, height, model, image, signals, centres, fwhm, scale, *, coloured=False):
     """Returns True if a residual peak is a source of its own, by this module's criteria.
 
     place (2,) ints: (y, x) of the peak; height [sigma]: of the residual there, from
@@ -135,6 +138,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     model, image (Ny, Nx) [sigma]: models, what was searched
     signals: SignalToNoise of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
+    coloured: its spectrum must be another
     """
     at = tuple(place)
     inside = np.clip(np.rint(centres).astype(int), 0, np.array(image.shape) - 1)
@@ -143,7 +147,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     host = np.argmax(np.log(heights) - away / fwhm)  # brightest if light falls by e per FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
     part = CLUMP * away[host] * scale / CLUMP_ARCSEC
-    if height >= np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump:
+    if not coloured and height >= np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump:
         return True
     if height < COLOURED * clump:
         return False
@@ -152,7 +156,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     differs = sum(
         _other_colour(at, s.spectra, near, inside[host]) for s in signals if len(s.channels) > 1
     )
-    return bool(differs > OTHER_COLOUR)
+    return bool(differs > (CLEAR_COLOUR if coloured else OTHER_COLOUR))
 
 
 def _other_colour(at, spectra, centres, host):

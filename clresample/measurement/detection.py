@@ -6,8 +6,8 @@ Three searches, each of which adds new sources:
    separates neighbours best
 2. all observations together, under filters of several widths (`combine_bands`), which detects
    faint sources, large ones and those bright in few bands
-3. the sharpest observation minus the symmetric light of the sources so far (`companions.py`), which
-   shows neighbours on the flanks of brighter sources
+3. every observation minus the symmetric light of the sources so far (`companions.py`), which shows
+   neighbours on the flanks of brighter sources, in all but the sharpest those of another colour
 
 Sources: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 (A&AS 117, 393);
 those of signal_to_noise.py and companions.py.
@@ -93,9 +93,10 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
     the images are searched one after the other, the sharpest first and then all together under
     filters of several widths. A peak within 0.7 FWHM of the image's PSF of an earlier source is
-    the same source. Finally the sharpest image is searched without the symmetric light of these
-    sources. Cosmic rays that one channel alone shows are masked and the light of stars with a
-    saturated core is removed first. Needs `sep` (the extra `detect`).
+    the same source. Finally each image is searched without the symmetric light of these sources,
+    all but the sharpest for those of another colour. Cosmic rays that one channel alone shows are
+    masked and the light of stars with a saturated core is removed first. Needs `sep` (the extra
+    `detect`).
 
     observations: sequence of Observation, see `check_observations`, or of astropy's NDData and
         CCDData that have a PSF
@@ -300,12 +301,16 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     for i in order[1:]:
         found.add(levelled[i].flat(), observations[i].label, widths[i], widths[i])
     found.add(best, ALL, widths.min(), widths.max())
-    if beside and found.positions:
-        places = np.array(found.positions)
-        new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
+    for i in order if beside else ():
+        if not found.positions:
+            break
+        given = everything, np.array(found.positions), threshold, widths[i], scale
+        # of its neighbour's colour the sharpest image would show it
+        coloured = i != sharp and len(observations[i].channels) > 1
+        new = _companions(sep, levelled, i, *given, coloured=coloured)
         # the residual light of a star is not symmetric about a source on it
-        new = [one for one in new if not held[sharp][tuple(np.rint(one[0]).astype(int))]]
-        found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
+        new = [one for one in new if not held[i][tuple(np.rint(one[0]).astype(int))]]
+        found.add_companions(new, signals[i].flat(), observations[i].label)
     order, groups = found.in_order()
     positions = [found.position_of(i) for i in order]
     points = [
@@ -322,13 +327,13 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     )
 
 
-def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale):
+def _companions(sep, signals, one, everything, places, threshold, fwhm, scale, *, coloured=False):
     """Positions and heights of sources on the flanks of those at `places` (S, 2).
 
-    They are found in the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]:
-    of a pixel.
+    They are found in observation number `one`, whose PSF has the width fwhm [px]; scale [arcsec]:
+    of a pixel; coloured: see `is_a_source`
     """
-    image, seen = signals[sharp].flat(), signals[sharp].measured
+    image, seen = signals[one].flat(), signals[one].measured
     centres = np.array(
         [
             parabolic_peak(image if image[tuple(p.astype(int))] > threshold else everything, p)
@@ -336,7 +341,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
         ]
     )
     rest, model = symmetric_residual(image, seen, centres)
-    wide, _ = symmetric_residual(signals[sharp].flat(SMALL_GALAXY), seen, centres)
+    wide, _ = symmetric_residual(signals[one].flat(SMALL_GALAXY), seen, centres)
     noise = residual_scatter(model)
     new = new_peaks(
         sep,
@@ -360,7 +365,8 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
             continue
         if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:
             continue
-        if is_a_source(at, height, model, image, signals, centres, fwhm, scale):
+        given = model, image, signals, centres, fwhm, scale
+        if is_a_source(at, height, *given, coloured=coloured):
             found.append((top, height))
     return found
 

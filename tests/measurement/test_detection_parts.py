@@ -71,7 +71,7 @@ def two_widths():
 @pytest.mark.parametrize("away, n", [(4.0, 1), (9.0, 2)])
 def test_a_peak_of_all_images_within_the_wider_psf_is_the_same_source(monkeypatch, away, n):
     """FWHM 3.5 and 8 px: 4 px away counts as the source of the sharp image, 9 px do not."""
-    found = [(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)], []
+    found = [(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)], [], []
     each = iter(found)
     monkeypatch.setattr(peaks, "_objects", lambda *_: (next(each), np.zeros(GRID.shape, int)))
     found = detect(two_widths(), model_frame(two_widths(), grid=GRID))
