@@ -86,7 +86,7 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         snr: signal to noise of all B bands together, negative fluxes as 0,
             sqrt(sum_b max(flux_b, 0)^2 / variance_b); about sqrt(B / 2) without a source
         n_components: number of components; two if the core has a significantly different colour,
-            see `ExtendedSource`
+            or lies in far wider light, see `ExtendedSource`
         *_centroid: the same positions, of the fitted light
         rms_size [arcsec], e1, e2, position_angle [deg]: see `shapes.shape`. They are those of the
             model under the model's PSF, not deconvolved. A source's components are weighted by

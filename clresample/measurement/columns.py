@@ -51,7 +51,7 @@ DEFINITIONS = definitions(
         "dec": ("declination of the position", u.deg),
         "y_sky": ("of the position on the flat sky", u.arcsec),
         "x_sky": ("of the position on the flat sky", u.arcsec),
-        "n_components": ("of the model: 2 where its core has another colour", None, np.int64),
+        "n_components": ("of the model: 2 where its core differs from the rest", None, np.int64),
         "rms_size": ("root of the mean second moment of light under the model's PSF", u.arcsec),
         "e1": "ellipticity of the fitted light: above 0 where it is stretched north - south",
         "e2": "ellipticity of the fitted light: above 0 if stretched north-east - south-west",

@@ -6,8 +6,9 @@ Three searches, each of which adds new sources:
    separates neighbours best
 2. all observations together, under filters of several widths (`combine_bands`), which detects
    faint sources, large ones and those bright in few bands
-3. every observation minus the symmetric light of the sources so far (`companions.py`), which shows
-   neighbours on the flanks of brighter sources, in all but the sharpest those of another colour
+3. the sharpest observation minus the symmetric light of the sources so far (`companions.py`), which
+   shows neighbours on the flanks of brighter sources; so do others of several channels, if these
+   are of another colour
 
 Sources: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 (A&AS 117, 393);
 those of signal_to_noise.py and companions.py.
@@ -93,10 +94,10 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
     the images are searched one after the other, the sharpest first and then all together under
     filters of several widths. A peak within 0.7 FWHM of the image's PSF of an earlier source is
-    the same source. Finally each image is searched without the symmetric light of these sources,
-    all but the sharpest for those of another colour. Cosmic rays that one channel alone shows are
-    masked and the light of stars with a saturated core is removed first. Needs `sep` (the extra
-    `detect`).
+    the same source. Finally the sharpest image is searched without the symmetric light of these
+    sources, and others of several channels for some of another colour. Cosmic rays that one channel
+    alone shows are masked and the light of stars with a saturated core is removed first. Needs
+    `sep` (the extra `detect`).
 
     observations: sequence of Observation, see `check_observations`, or of astropy's NDData and
         CCDData that have a PSF
@@ -301,13 +302,12 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     for i in order[1:]:
         found.add(levelled[i].flat(), observations[i].label, widths[i], widths[i])
     found.add(best, ALL, widths.min(), widths.max())
+    # of its neighbour's colour the sharpest image would show a source
     for i in order if beside else ():
-        if not found.positions:
-            break
+        if not found.positions or (i != sharp and len(observations[i].channels) == 1):
+            continue
         given = everything, np.array(found.positions), threshold, widths[i], scale
-        # of its neighbour's colour the sharpest image would show it
-        coloured = i != sharp and len(observations[i].channels) > 1
-        new = _companions(sep, levelled, i, *given, coloured=coloured)
+        new = _companions(sep, levelled, i, *given, coloured=i != sharp)
         # the residual light of a star is not symmetric about a source on it
         new = [one for one in new if not held[i][tuple(np.rint(one[0]).astype(int))]]
         found.add_companions(new, signals[i].flat(), observations[i].label)

@@ -28,7 +28,7 @@ from scipy.ndimage import (
 )
 
 from ..deblending.inspection.image import brightness, typical_sigma
-from ..deblending.inspection.psf_samples import ring_mean
+from ..deblending.inspection.psf_samples import inscribed_radius, ring_mean
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import MAX_FLATTER, star_cores
 from ..deblending.inspection.star_profile import RadialProfile
@@ -56,7 +56,7 @@ MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 MIN_CORE_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
 SAME_STAR_FWHM = 1.0
-# [sigma] Smallest light, in another channel, of a star that is saturated in one.
+# [sigma] Smallest light in another channel that tells a star from a gap.
 MIN_POINT_SIGMAS = 10.0
 # Median |x| of a unit Gaussian, inverted.
 SIGMAS_A_MAD = 1.4826
@@ -92,22 +92,24 @@ def saturated_stars(observations, frame) -> list[StarPlace]:
 
 
 def _is_gap(light, usable, psf, c, core):
-    """Returns True if a core of channel c is a gap over a galaxy, or over nothing.
+    """Returns True if a core of channel c is a gap over a galaxy, by the other channels.
 
-    By the brightest other channel in which all of it is seen: there a star is a point.
+    By the brightest one in which all of it is seen: there a star is a point.
     light, usable (C, My, Mx): of all channels, see `star_cores`
     """
-    away = np.hypot(*(np.indices(light.shape[1:]) - core.place[:, None, None]))
     radius = max(core.radius, float(psf.fwhm_px.max()))
-    ring, disc = np.abs(away - radius) < 1, away < radius + 1
-    middle = away < max(1.0, away.min() + 0.5)
-    others = [k for k in range(len(light)) if k != c and usable[k][disc].all()]
-    if not others:
+    low = np.maximum(np.floor(core.place - radius - 2).astype(int), 0)
+    window = tuple(slice(a, int(b + radius + 3)) for a, b in zip(low, core.place, strict=True))
+    light, usable = light[:, *window], usable[:, *window]
+    away = np.hypot(*(np.indices(light.shape[1:]) + (low - core.place)[:, None, None]))
+    disc, middle = away < radius + 1, away < away.min() + 0.5
+    seen = [k for k in range(len(light)) if k != c and usable[k][disc].all()]
+    peak, k = max(((float(light[k][middle].max()), k) for k in seen), default=(0.0, c))
+    if peak < MIN_POINT_SIGMAS or radius > inscribed_radius(psf, k):
         return False
-    peak, k = max((float(light[k][middle].max()), k) for k in others)
-    top = max(ring_mean(psf, k, r) for r in (0.0, 0.5))
-    point = peak * max(ring_mean(psf, k, radius), 0.0) / top
-    return peak < MIN_POINT_SIGMAS or float(np.median(light[k][ring])) > MAX_FLATTER * point + 1
+    point = peak * ring_mean(psf, k, radius) / ring_mean(psf, k, 0.0)
+    ring = light[k][np.abs(away - radius) < 1]
+    return bool(np.median(ring) > MAX_FLATTER * max(point, 0.0) + 1)
 
 
 def _merged(found):

@@ -61,11 +61,11 @@ POINT = ((0.0, 0.0), 0.0, (0.0, 0, 2e4, 0))
     [
         ([((0.0, 0.0), 0.0, (0.0, 2e4, 0, 2e4))], 1),
         ([((0.0, 0.0), 0.5, (0.0, 2e4, 0, 2e4))], 0),
-        ([], 0),
+        ([], 1),
     ],
 )
-def test_a_core_masked_in_one_band_is_a_stars_if_others_show_a_point(others, n_stars):
-    """A gap over a galaxy, or over nothing, is none."""
+def test_a_core_masked_in_one_band_is_a_stars_unless_others_show_a_galaxy(others, n_stars):
+    """There are gaps over galaxies; where others show nothing, they cannot tell."""
     mask = np.zeros((3, 40, 40), bool)
     mask[1, 18:22, 18:22] = True
     o = observed("blurred", [POINT, *others], mask=mask)

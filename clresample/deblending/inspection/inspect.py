@@ -19,7 +19,7 @@ from .matched_widths import width_lines
 from .noisy_variance import prepared
 from .pixel_noise import noise_lines
 from .star_psfs import may_be_star, replace_by_stars, with_star_psfs
-from .stars import misfitting_widths, points
+from .stars import misfitting_widths, point_sources
 from .tilt import tilt_lines
 
 # A sky level is reported as left in or over-subtracted above this many of its errors, and above
@@ -133,7 +133,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, observations=observations)
     n_wide, n_own, n_all = n_channels
     may_be_stars = np.array([may_be_star(source) for source in sources], bool)
-    is_point = points(images, settings.psf_error) & may_be_stars
+    is_point = point_sources(images, may_be_stars, settings.psf_error)
     stars, still = near[(n_wide > 0) | is_point], near[(n_own > 0) & (n_own == n_all)]
     if len(stars):
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))

@@ -149,7 +149,7 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
     if not found:
         return image, n_wide, n_own
     o, numbers = image.observation, sorted(found)
-    psfs = tuple(_combine_psfs(_listed_psf(o, image.listed[i]), found[i]) for i in numbers)
+    psfs = tuple(_combine_psfs(listed_psf(o, image.listed[i]), found[i]) for i in numbers)
     flux_error = np.zeros((len(numbers), len(grown)))
     measured_px = np.full(flux_error.shape, np.inf)
     for k, i in enumerate(numbers):
@@ -168,7 +168,7 @@ def replace_by_stars(sources, numbers, still):
     """
     found = list(sources)
     for i in numbers:
-        keys = ("sky_deg", "position_px", "observation", "name")
+        keys = ("sky_deg", "position_px", "observation", "name", "sky_frame")
         given = {key: getattr(sources[i], key) for key in keys}
         free = i not in still and getattr(sources[i], "free_position", True)
         found[i] = PointSource(**given, free_position=free)
@@ -186,7 +186,7 @@ def may_be_star(source):
     )
 
 
-def _listed_psf(observation, place):
+def listed_psf(observation, place):
     """The PSF of an observation at a place (2,) [px], as the user passed it."""
     if observation.psf_field is None:
         return observation.psf
@@ -229,7 +229,7 @@ def _measure_psf(image, c, i, core, is_wide, sky):
         sky level is fitted
     """
     o, fwhm, place = image.observation, float(image.observation.psf.fwhm_px[c]), image.places[i]
-    psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
+    psf, (n_y, n_x) = listed_psf(o, place), image.usable.shape[1:]
     # the fit has no sky level, or a fitted one
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
     middle, radius = core.place, core.radius + WIDE_GROW_PX

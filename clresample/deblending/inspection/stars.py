@@ -8,6 +8,7 @@ import numpy as np
 
 from ...sky.sources import PointSource
 from .psf_samples import psf_at
+from .star_psfs import listed_psf
 
 # [sigma] Light of a source, in one channel, whose width is then known to a few percent.
 STAR_SIGMAS = 50.0
@@ -28,8 +29,9 @@ WIDTH_STEP, SHIFT_STEP = 0.05, 0.1
 # bright is far wider. Under a PSF of 1.6 or 2 px no galaxy profile is as sharp as a star on pixels
 # of the model, and stars of signal to noise 1200, photon noise included, ended as misfits.
 POINT_SIGMAS = 100.0
-# [its error] Largest level about such a star: more is of a host or a neighbour.
-MAX_LEVEL_SIGMAS = 5.0
+# [its error] Largest level about such a star: more is of a host or a neighbour. [scatter of chi2]
+# What noise may leave.
+MAX_LEVEL_SIGMAS, NOISE_SIGMAS = 5.0, 3.0
 # Rounds in which the PSF is moved to the light, and [px] its largest move in one: a star 1 px from
 # its place under a PSF of 2.3 px FWHM was named 15 % wider than it.
 MAX_ROUNDS, MAX_MOVE_PX = 6, 0.7
@@ -41,7 +43,7 @@ class Width(NamedTuple):
     part [1]: relative excess of the light's width over the PSF's, negative if it is narrower;
         error: of it, infinite where it cannot be measured
     sigmas: of the light; level: over its error
-    rest [1]: norm of the remaining light, beyond the noise's, over that of all
+    rest [1]: norm of the remaining light, beyond what noise leaves, over that of all
     """
 
     channel: int
@@ -52,21 +54,22 @@ class Width(NamedTuple):
     rest: float = 0.0
 
 
-def points(images, psf_error):
+def point_sources(images, may_be_star, psf_error):
     """Selects sources (S,) that look like the PSF: stars, whatever they are listed as.
 
-    By the sharpest of InspectedImages that shows POINT_SIGMAS of their light. psf_error [1]: of the
-    PSF's width, see Settings
+    By the sharpest of InspectedImages that shows POINT_SIGMAS of their light, or less and that they
+    are wider. may_be_star (S,): bool; psf_error [1]: of the PSF's width, see Settings
     """
-    found, seen = np.zeros((2, len(images[0].places)), bool)
+    found, left = np.zeros_like(may_be_star), may_be_star.copy()
     for image in sorted(images, key=lambda one: one.width_arcsec):
-        for i in image.brightest[image.light[image.brightest] > POINT_SIGMAS]:
+        for i in np.flatnonzero(left & image.inside & (image.light > STAR_SIGMAS)):
             w = _width(image, i)
-            if seen[i] or w.sigmas < POINT_SIGMAS:
+            is_wide = w.part - WIDTH_SIGMAS * w.error > psf_error
+            if w.sigmas < POINT_SIGMAS and not is_wide:
                 continue
             unlike = max(abs(w.part) - WIDTH_SIGMAS * w.error, w.rest)
             found[i] = unlike <= psf_error and abs(w.level) <= MAX_LEVEL_SIGMAS
-            seen[i] = True
+            left[i] = False
     return found
 
 
@@ -117,11 +120,12 @@ def _width(image, i):
     core = np.hypot(y - place[0], x - place[1]) <= image.width_px
     if not good[core].all() or good.mean() < MIN_USABLE:
         return Width(c)
+    psf = listed_psf(image.observation, image.listed[i])
     root = np.where(good, np.sqrt(image.observation.weights[c, y, x]), 0).ravel() * image.sigma[c]
     z = np.where(good, light[c], 0).ravel().astype(float)
     for _ in range(MAX_ROUNDS):
         away = y[:, 0] - place[0], x[0] - place[1]
-        design = _columns(image.observation.psf, c, *away) * root
+        design = _columns(psf, c, *away) * root
         inverse = np.linalg.pinv(design @ design.T)
         found = inverse @ (design @ z)
         sigmas = found[1] * np.sqrt((design[1] ** 2).sum())
@@ -132,13 +136,14 @@ def _width(image, i):
             rest, n_free = z - found @ design, good.sum() - len(found)
             spread = max(1.0, float(rest @ rest) / n_free)
             error = np.sqrt(np.diagonal(inverse) * spread)
+            more = (spread - 1) * n_free - NOISE_SIGMAS * np.sqrt(2 * n_free)
             return Width(
                 channel=c,
                 part=found[4] / found[1],
                 error=error[4] / found[1],
                 sigmas=sigmas,
                 level=found[0] / error[0],
-                rest=np.sqrt((spread - 1) * n_free) / sigmas,
+                rest=np.sqrt(max(more, 0.0)) / sigmas,
             )
         place = place + np.clip(shift, -MAX_MOVE_PX, MAX_MOVE_PX)
     return Width(c)

@@ -85,10 +85,11 @@ def _best_ends(fit, rest, groups, windows, first):
     at = np.reshape(part.at, (2, N_ENDS, n_all))
     small = np.array([i in groups[g] for g, i in members])
     larger = np.array([members.index((g, groups[g][i])) for g, i in members if i in groups[g]])
-    own = part.theta[*at[:, -1, small]]
-    part.theta[*at[:, 1:, small]] = part.theta[*at[:, 1:, larger]]
-    part.theta[*at[:, -1, larger]] = own
+    part.theta[*at[:, 1:-1, small]] = part.theta[*at[:, 1:-1, larger]]
     part.moves[*at[:, 2, small]] = False
+    found = _exchanged(fit.looking.components, groups, members)
+    pairs = np.array(found, int).reshape(-1, 2)
+    part.theta[*at[:, -1, pairs]] = part.theta[*at[:, -1, pairs[:, ::-1]]]
     part._take(every, doubt=False)
     part._step(every[len(groups) :])
     chi2 = part.chi2_as_expected(every).reshape(N_ENDS, -1)
@@ -104,6 +105,22 @@ def _best_ends(fit, rest, groups, windows, first):
     fit.theta[*np.array(fit.at)[:, chosen[moved]]] = theta[here][moved]
     fit.looking.spectra[chosen[moved]] = spectra[here][moved]
     return chosen[moved].tolist()
+
+
+def _exchanged(components, groups, members):
+    """Places (k, 2) among `members` of the pairs of groups that exchange their profiles.
+
+    A larger one exchanges with the nearest of its smaller ones, if it is no smaller one itself.
+    """
+    nearest: dict = {}
+    for k, (g, i) in enumerate(members):
+        j = groups[g].get(i)
+        if j is None or j in groups[g]:
+            continue
+        away = np.hypot(*np.subtract(components[i].position, components[j].position))
+        one = away, k, members.index((g, j))
+        nearest[g, j] = min(nearest.get((g, j), one), one)
+    return [pair for _, *pair in nearest.values()]
 
 
 def _windows(looking, sight, groups):

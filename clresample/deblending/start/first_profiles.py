@@ -138,7 +138,7 @@ def _next(looking, models, rest, error):
     best = np.array([a + np.argmax(gain[a:b]) for a, b in zip(first, [*first[1:], len(gain)])])
     going = np.unique(around.scene[best][gain[best] > gain[first] + NEED])
     at = best[np.isin(around.scene[best], going)]
-    return dict(_apart(around, listed, gain, at))
+    return dict(apart(around, listed, gain, at))
 
 
 def products_beside(looking, models, listed, error):
@@ -164,7 +164,7 @@ def products_beside(looking, models, listed, error):
     return around, right, light, alone
 
 
-def _apart(around, listed, gain, at):
+def apart(around, listed, gain, at):
     """Selects the components of the largest gain (n,) at these places, with disjoint boxes.
 
     listed (n): components; at: the places among them that compete

@@ -44,6 +44,7 @@ class ProfileFit:
     moves (B, n): bool, those whose parameters are fitted; others are drawn without slopes
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs. At the
         end, faint galaxies have the sizes and wings of their grids in theta
+    chi2_at_end (B,): as if the prior were the first one, before the sizes of grids
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
@@ -62,6 +63,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
+        self.chi2_at_end = self.chi2
         self.brightness = np.zeros(len(shapes))
         self.flux_estimate = np.repeat(np.zeros_like(looking.spectra)[:, None], 3, axis=1)
         self.flux_doubt = np.zeros((*looking.spectra.shape, 0))
@@ -90,6 +92,7 @@ class ProfileFit:
             doubted = (self.population.contamination[scenes] > 1).any(axis=1)
             _run_without_doubt(self, scenes[doubted])
         run_from_equal_profiles(self, some)
+        self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
 
     def _copy(self):

@@ -32,7 +32,7 @@ from ..view import WhitenedView, pixel_noise
 from .first_profiles import NEED
 from .profile_fit import CHI2_TOL, ProfileFit, start_from
 from .star_weights import allow_for_psf_error
-from .wide_light import wide_profiles
+from .wide_light import n_bands, wide_profiles
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -122,16 +122,23 @@ def fit_start_profiles(
     fit_sky: also a level per channel; tol: see ProfileFit
     second: give galaxies in light that is far wider a second component, see wide_light.py
     """
+    return _started(patches, fit_sky, tol, second)[0]
+
+
+def _started(patches, fit_sky, tol, second):
+    """The StartingPoints and chi2 (B,) of patches, see `fit_start_profiles`."""
     fit, points = _fitted(patches, fit_sky, tol)
+    chi2 = fit.chi2_at_end.copy()
     wider = _with_wide_light(patches, fit, points) if second else {}
     if wider:
-        again, others = _fitted(list(wider.values()), fit_sky, tol)
-        chi2, scenes = fit.chi2_as_expected(list(wider)), np.arange(len(wider))
-        better = again.chi2_as_expected(scenes) < chi2 - NEED
-        for b, point, gained in zip(wider, others, better, strict=True):
-            if gained:
+        least = NEED + n_bands(fit.looking)
+        for b, point, lower in zip(
+            wider, *_started(list(wider.values()), fit_sky, tol, second), strict=True
+        ):
+            if lower < chi2[b] - least:
                 points[b] = replace(point, undetected=points[b].undetected)
-    return points
+                chi2[b] = lower
+    return points, chi2
 
 
 def _fitted(patches, fit_sky, tol):

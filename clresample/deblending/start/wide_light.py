@@ -7,7 +7,8 @@ galaxy whose surroundings hold light in the residuals of the profiles,
     gain = sum_c max(0, <w, r>)^2 / |w|^2,
 
 w the whitened image of a wide profile at its place, gets that profile as its second component, and
-all profiles are fitted again.
+all profiles are fitted again. Of several whose wide profiles overlap the one of the largest gain
+has the light; the others are tested in what is then left.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from ...sky.psf import SIGMAS_A_FWHM
 from ..linear.spectra import MODEL_ERROR
-from .first_profiles import GROWTH, NEED, products_beside
+from .first_profiles import GROWTH, NEED, apart, products_beside
 
 # Sigmas of wide profiles, in that of the sharpest PSF. Wider ones would take up what is left of the
 # sky: 0.05 sigma a pixel within 9 times a PSF of 3.5 px gains 5.
@@ -39,14 +40,17 @@ def wide_profiles(fit, candidates) -> dict:
         return {}
     scenes = {int(looking.scene[i]) for i, _ in listed}
     models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, list(scenes)))}
-    _, right, _, alone = products_beside(looking, models, listed, MODEL_ERROR)
+    around, right, _, alone = products_beside(looking, models, listed, MODEL_ERROR)
     square = np.maximum(right, 0) ** 2
-    gain = np.divide(square, alone, out=np.zeros_like(alone), where=alone > 0).sum(axis=1)
-    found: dict = {}
-    for k in np.argsort(gain, kind="stable"):
-        if gain[k] > NEED + looking.n_channels:
-            found[listed[k][0]] = listed[k][1]
-    return found
+    gain = np.divide(square, alone, out=np.zeros_like(alone), where=alone > 0)
+    gain = (gain if looking.ties is None else gain[:, looking.ties.first]).sum(axis=1)
+    shown = np.flatnonzero(gain > NEED + n_bands(looking))
+    return dict(apart(around, listed, gain, shown))
+
+
+def n_bands(looking):
+    """Number of bands, of which a second component has a flux each."""
+    return looking.n_channels if looking.ties is None else looking.ties.n_bands
 
 
 def _signal_to_noise(looking):
