@@ -44,6 +44,14 @@ def test_a_point_in_a_host_and_faint_points_stay_galaxies():
     assert kinds(((STAR[0], (300, 500), 0.0),)) == [ExtendedSource]
 
 
+def test_a_nucleus_in_a_wide_faint_host_is_none():
+    """The host is a thousandth of its light within the PSF."""
+    nucleus, host = (STAR[0], (6000, 9000), 0.0), (STAR[0], (2000, 3000), 9.0)
+    for drawn, kind in (((nucleus,), PointSource), ((nucleus, host), ExtendedSource)):
+        found = inspected([with_photon_noise(drawn)], sources_of((nucleus,)))
+        assert [type(source) for source in found.blend.sources] == [kind]
+
+
 def test_a_number_of_components_that_is_given_stays():
     o = with_photon_noise((STAR,))
     one = (ExtendedSource(position_px=STAR[0], n_components=1),)
