@@ -106,8 +106,9 @@ class Settings(FitSettings):
         over 5 sigma; the status of a fit counts it as noise in stars' light. The weights use the
         stars' light at the start of the fit, and are then constant. Stars whose error is below 0.05
         sigma everywhere have no effect. Beside a star of signal to noise 1e4 whose PSF is 1 % too
-        wide, the SDR of galaxies increases from 7.7 to 12.0 dB (bench.stars, docs/noise.md). Larger
-        values allow for worse PSFs, and cost precision
+        wide, the SDR of galaxies increases from 7.7 to 12.0 dB (bench.stars, docs/noise.md). Bright
+        sources of the PSF's width, within this fraction, are fitted as stars, whatever they are
+        listed as. Larger values allow for worse PSFs, and cost precision
     psf_tolerance [1]: largest error of each source's PSF if PSFs vary over an observation
         (PSFField), relative to the norm of its samples (PSFBasis.max_error). Fits use different
         PSFs for sources if the PSF varies by more. With 0.001 a star of signal to noise 1000 has an

@@ -131,11 +131,9 @@ def _started(patches, fit_sky, tol, second):
     chi2 = fit.chi2_at_end.copy()
     wider = _with_wide_light(patches, fit, points) if second else {}
     if wider:
-        least = NEED + n_bands(fit.looking)
-        for b, point, lower in zip(
-            wider, *_started(list(wider.values()), fit_sky, tol, second), strict=True
-        ):
-            if lower < chi2[b] - least:
+        again = _started(list(wider.values()), fit_sky, tol, second)
+        for b, point, lower in zip(wider, *again, strict=True):
+            if lower < chi2[b] - NEED - n_bands(fit.looking):
                 points[b] = replace(point, undetected=points[b].undetected)
                 chi2[b] = lower
     return points, chi2
