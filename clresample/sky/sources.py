@@ -169,3 +169,12 @@ class ExtendedSource(Source):
             )
         if not profile.any():
             raise ValueError("profile is zero everywhere")
+
+
+def is_open(source) -> bool:
+    """Returns True for a galaxy of which only the position is given: data choose its components."""
+    return (
+        isinstance(source, ExtendedSource)
+        and source.n_components is None
+        and source.profile is None
+    )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
+from ...sky.sources import is_open
 from ..blend import Blend
 from ..settings import AUTO, SMALL, FitSettings
 from . import listing, shifted, spoilt
@@ -18,7 +19,7 @@ from .levels import SkyLevel, sky_level
 from .matched_widths import width_lines
 from .noisy_variance import prepared
 from .pixel_noise import noise_lines
-from .star_psfs import may_be_star, replace_by_stars, with_star_psfs
+from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths, point_sources
 from .tilt import tilt_lines
 
@@ -132,8 +133,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
     n_wide, n_own, n_all = n_channels
-    may_be_stars = np.array([may_be_star(source) for source in sources], bool)
-    is_point = point_sources(images, may_be_stars, settings.psf_error)
+    listed_open = np.array([is_open(source) for source in sources], bool)
+    is_point = point_sources(images, listed_open, settings.psf_error)
     stars, still = near[(n_wide > 0) | is_point], near[(n_own > 0) & (n_own == n_all)]
     if len(stars):
         blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))

@@ -29,7 +29,7 @@ from scipy.ndimage import (
 
 from ...sky.observation import with_psf_field
 from ...sky.psf import PSF, SIGMAS_A_FWHM
-from ...sky.sources import ExtendedSource, PointSource
+from ...sky.sources import PointSource, is_open
 from ...sky.varying_psf.field import PSFField
 from .psf_samples import inscribed_radius, psf_at, ring_mean
 from .spoilt import GROW_PX
@@ -121,7 +121,8 @@ def with_star_psfs(image, sources, sky, sky_beside_wide):
     sources: those of `image.places`; sky, sky_beside_wide: True if a sky level is fitted,
         without and with wide cores
     """
-    stars = [i for i, source in enumerate(sources) if may_be_star(source) and image.inside[i]]
+    may_be_star = np.array([isinstance(s, PointSource) or is_open(s) for s in sources], bool)
+    stars = np.flatnonzero(may_be_star & image.inside).tolist()
     found, (n_wide, n_own) = {}, np.zeros((2, len(sources)), int)
     if not stars or image.usable.all():
         return image, n_wide, n_own
@@ -173,17 +174,6 @@ def replace_by_stars(sources, numbers, still):
         free = i not in still and getattr(sources[i], "free_position", True)
         found[i] = PointSource(**given, free_position=free)
     return tuple(found)
-
-
-def may_be_star(source):
-    """Returns True if a source is a star, or has no property but its position."""
-    if isinstance(source, PointSource):
-        return True
-    return (
-        isinstance(source, ExtendedSource)
-        and source.n_components is None
-        and source.profile is None
-    )
 
 
 def listed_psf(observation, place):

@@ -60,13 +60,13 @@ class Width(NamedTuple):
     place: tuple[float, ...] = ()
 
 
-def point_sources(images, may_be_star, psf_error):
-    """Selects sources (S,) that look like the PSF: stars, whatever they are listed as.
+def point_sources(images, listed, psf_error):
+    """Selects those of the sources `listed` (S,) bool that look like the PSF: stars.
 
     By the sharpest of InspectedImages that shows POINT_SIGMAS of their light, or less and that they
-    are wider. may_be_star (S,): bool; psf_error [1]: of the PSF's width, see Settings
+    are wider. psf_error [1]: of the PSF's width, see Settings
     """
-    found, left = np.zeros_like(may_be_star), may_be_star.copy()
+    found, left = np.zeros_like(listed), listed.copy()
     for image in sorted(images, key=lambda one: one.width_arcsec):
         for i in np.flatnonzero(left & image.inside & (image.light > STAR_SIGMAS)):
             w = _width(image, i)
@@ -90,8 +90,7 @@ def _host_light(image, i, width, psf_error):
     reach = min(HOST_FWHM * image.width_px, inscribed_radius(psf, c))
     (y,), (x,), (on,) = image.patches(np.array([i]), int(np.ceil(reach)))
     away = np.hypot(y - y0, x - x0)
-    others = np.delete(image.places, i, axis=0)
-    others = others[np.isfinite(others).all(axis=1)]
+    others = _others(image, i)
     good = on & image.usable[c, y, x] & (away < reach)
     for place in others[np.hypot(*(others - image.places[i]).T) < 2 * reach]:
         good &= np.hypot(y - place[0], x - place[1]) > NEIGHBOUR_FWHM * image.width_px
@@ -130,10 +129,14 @@ def misfitting_widths(image, sources):
 
 def _alone(image, i):
     """Returns True if no other source lies near to source i."""
-    others = np.delete(image.places, i, axis=0)
-    others = others[np.isfinite(others).all(axis=1)]
-    away = np.hypot(*(others - image.places[i]).T)
+    away = np.hypot(*(_others(image, i) - image.places[i]).T)
     return not (away < NEIGHBOUR_FWHM * image.width_px).any()
+
+
+def _others(image, i):
+    """Places (n, 2) [px] of the sources but source i."""
+    others = np.delete(image.places, i, axis=0)
+    return others[np.isfinite(others).all(axis=1)]
 
 
 def _width(image, i):

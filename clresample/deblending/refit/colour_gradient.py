@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...sky.sources import ExtendedSource
+from ...sky.sources import is_open
 from ..component_images import ComponentImages, local_chi2
 from ..linear.rendered_models import model_of, render_models
 
@@ -77,20 +77,11 @@ def _candidates(fit):
         return np.zeros(0, int)
     source = fit.fitted[fit.start.source]
     single = np.bincount(fit.start.source)[fit.start.source] == 1
-    free = [_is_free(fit.blend.sources[i]) for i in source] & single
+    free = [is_open(fit.blend.sources[i]) for i in source] & single
     snr = np.sqrt((fit.state.spectra**2 * fit.scene.spectrum_curvature).sum(1))
     seen = (fit.state.spectra > 0) & (fit.scene.spectrum_curvature > 0)
     seen_in = (seen if fit.ties is None else fit.ties.total(seen) > 0).sum(1)
     return np.flatnonzero(free & (snr > MIN_SNR) & (seen_in > 1))
-
-
-def _is_free(source):
-    """Returns True if the data choose a source's number of components."""
-    return (
-        isinstance(source, ExtendedSource)
-        and source.n_components is None
-        and source.profile is None
-    )
 
 
 def _asked(fit, which, seen):

@@ -23,7 +23,7 @@ import numpy as np
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
-from ...sky.sources import ExtendedSource, PointSource
+from ...sky.sources import PointSource, is_open
 from ..linear.component_batch import StartComponent, renumbered
 from ..linear.linearised_scenes import linearise
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
@@ -159,7 +159,7 @@ def _fitted(patches, fit_sky, tol):
 def _with_wide_light(patches, fit, points):
     """{scene: its StartInput with second components} of a ProfileFit, see wide_light.py."""
     components = fit.looking.components
-    free = [_may_have_two(patches[c.scene].sources[c.source], c.shape) for c in components]
+    free = [is_open(patches[c.scene].sources[c.source]) for c in components]
     found = wide_profiles(fit, np.array(free))
     inputs = {}
     for b in sorted({components[i].scene for i in found}):
@@ -174,12 +174,6 @@ def _with_wide_light(patches, fit, points):
                 thetas[own].append(wide)
         inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas))
     return inputs
-
-
-def _may_have_two(source, shape):
-    """Returns True if the data choose the number of a source's components, of which it has one."""
-    is_galaxy = isinstance(source, ExtendedSource) and isinstance(shape, GalaxyProfile)
-    return is_galaxy and source.n_components is None
 
 
 def with_psf_error_weights(patch, point: StartingPoint, settings):
