@@ -12,7 +12,7 @@ from ..deblending.linear.ties import Ties
 from ..deblending.posterior.errors import FluxChanges, PosteriorSampler
 from .array_hdus import array_of, image_hdu
 
-NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel")
+NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel", "n_narrow", "narrow_pixel")
 
 
 def draw_hdus(draws):
@@ -20,7 +20,7 @@ def draw_hdus(draws):
 
     DRAWNODES: a row for each node of the matrix: its modes, unknowns, position in the elimination
     order, and number of neighbours that are eliminated later; how many of the modes are smooth, and
-    their pixels, see ModeImages. DRAWLATER: these neighbours.
+    their pixels, of up to two widths, see ModeImages. DRAWLATER: these neighbours.
     DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated, smooth modes first; the factor
     consists of each node's diagonal block and the block below it, in elimination order. DRAWSUMS,
     DRAWUNIT, DRAWWIDE, DRAWBANDS: see PosteriorSampler. DRAWPAIRS, DRAWLIGHT: source and change,
@@ -37,8 +37,9 @@ def draw_hdus(draws):
     arrays = []
     for row, images in zip(rows, draws.modes, strict=False):
         if isinstance(images, ModeImages):
-            row[4:] = len(images.smooth), images.smooth.pixel
-            arrays += [images.smooth.values, images.sharp]
+            for k, part in enumerate(images.smooth):
+                row[4 + 2 * k : 6 + 2 * k] = len(part), part.pixel
+            arrays += [*(part.values for part in images.smooth), images.sharp]
         else:
             arrays.append(images)
     later = [node for nodes in factor.later for node in nodes]
@@ -83,7 +84,7 @@ def read_draws(hdus, shapes):
             below[v] = factor.take(sum(sizes[u] for u in later[v]), sizes[v])
     bands, pairs, light = (array_of(hdus[f"DRAW{x}"]) for x in ("BANDS", "PAIRS", "LIGHT"))
     return PosteriorSampler(
-        [_modes(modes, *given) for given in zip(shapes, counts, *smooth, strict=False)],
+        [_modes(modes, shape, n, own) for shape, n, *own in zip(shapes, counts, *smooth)],
         [sums.take(1 + count) for _, count in zip(shapes, counts, strict=False)],
         BlockCholesky.restore(
             sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below
@@ -95,12 +96,18 @@ def read_draws(hdus, shapes):
     )
 
 
-def _modes(arrays, shape, count, n_smooth, pixel):
-    """The modes of a component from an _ArrayReader, an array or ModeImages."""
-    if not pixel:
-        return arrays.take(count, *shape)
-    smooth = CellImages(arrays.take(n_smooth, *(-(-n // pixel) for n in shape)), int(pixel))
-    return ModeImages(smooth, arrays.take(count - n_smooth, *shape))
+def _modes(arrays, shape, count, smooth):
+    """The modes of a component from an _ArrayReader, an array or ModeImages.
+
+    smooth: number and pixel of each CellImages, 0 and 0 where there are none
+    """
+    pairs = [(n, int(pixel)) for n, pixel in zip(smooth[::2], smooth[1::2], strict=True) if pixel]
+    cells = [
+        CellImages(arrays.take(n, *(-(-side // pixel) for side in shape)), pixel)
+        for n, pixel in pairs
+    ]
+    sharp = arrays.take(count - sum(len(part) for part in cells), *shape)
+    return ModeImages(tuple(cells), sharp) if cells else sharp
 
 
 def _flat(arrays, dtype):

@@ -30,7 +30,7 @@ from .fits import add_provenance, celestial_header, open_fits, write_hdus
 from .fits_names import check_channels, check_columns, text_card
 from .tables import flag_table_hdu, table_hdu
 
-FORMAT = 6  # of the files; raised when an older reader would misread them
+FORMAT = 7  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, PointSource, ExtendedSource)}
 # of an observation, as JSON
 KEPT = ("name", "channels", "bands", "zero_points", "saturation", "unit", "n_invalid", "messages")

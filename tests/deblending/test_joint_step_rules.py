@@ -152,7 +152,7 @@ def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
         moves = found.moves[i]
         profile = one.scene.profile[i]
         given = one.scene.origin[i], profile, one.findings.strengths[i], one.prior.kernels()
-        images = SmoothModes(*given, one.overlap_mask(i), all_over=False).images.astype(float)
+        images = SmoothModes(*given, one.overlap_mask(i), all_over=False).images().astype(float)
         y, x = np.indices(profile.shape)
         middle = [(v * profile).sum() / profile.sum() for v in (y, x)]
         r2 = (y - middle[0]) ** 2 + (x - middle[1]) ** 2

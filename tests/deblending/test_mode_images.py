@@ -23,7 +23,7 @@ LARGE = (((32.4, 30.7), (2000, 1500, 2500), 9.0), ((40.0, 52.0), (90, 60, 90), 2
 def drawn(shape=(7, 10), pixel=4, k=(3, 2)):
     rng = np.random.default_rng(0)
     cells = k[0], *(-(-n // pixel) for n in shape)
-    return ModeImages(CellImages(rng.normal(size=cells), pixel), rng.normal(size=(k[1], *shape)))
+    return ModeImages((CellImages(rng.normal(size=cells), pixel),), rng.normal(size=(k[1], *shape)))
 
 
 def test_images_in_cells_are_arrays():
@@ -65,7 +65,7 @@ def given(device):
 
 def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
     """Of fluxes and moments, with sky and shifts; of what the bound did; of draws."""
-    monkeypatch.setattr(smooth_modes, "MAX_MODES", 40)
+    monkeypatch.setattr(smooth_modes, "MAX_MODES", 60)
     found, draws = [], []
     for wide in (True, False):
         with monkeypatch.context() as patch:
@@ -74,6 +74,8 @@ def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
             one = Posterior(*given, fit_sky=True, fit_shifts=True)
         sharp = [not isinstance(m, ModeImages) for m in one.modes]
         assert sharp == [not wide, True]
+        if wide:  # the wider bumps; narrower ones are sharp
+            assert [cells.pixel for cells in one.modes[0].smooth] == [2]
         run = np.arange(2), np.zeros((2, 3)), np.ones(3)
         found.append(one.errors(*run, np.zeros((0, 2, 3))))
         sampler = one.draws(*run)
@@ -91,6 +93,7 @@ def test_errors_on_wide_pixels_are_those_on_the_models(given, monkeypatch):
 def test_draws_on_wide_pixels_are_stored_bit_by_bit(given, monkeypatch):
     monkeypatch.setattr(smooth_modes, "MAX_MODES", 40)
     one = Posterior(*given)
+    assert [[cells.pixel for cells in m.smooth] for m in one.modes] == [[4, 2], [2]]
     sampler = one.draws(np.arange(2), np.zeros((2, 3)), np.ones(3))
     hdus = {hdu.name: hdu for hdu in draw_hdus(sampler)}
     back = read_draws(hdus, [m.shape[1:] for m in one.modes])

@@ -287,5 +287,5 @@ def test_results_of_an_older_format_are_refused(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(store, "FORMAT", 1)
     write_result(tmp_path / "blend.fits", fitted)
     monkeypatch.undo()
-    with pytest.raises(FileError, match="has format 1, this version reads 6: fit it again"):
+    with pytest.raises(FileError, match="has format 1, this version reads 7: fit it again"):
         read_result(tmp_path / "blend.fits")

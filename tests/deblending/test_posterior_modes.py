@@ -51,12 +51,12 @@ def test_bumps_are_convolutions_by_definition(least_light):
     gram = np.tensordot(wanted, seen, ((1, 2), (1, 2)))
     scale = 1 / np.sqrt(np.diag(gram))
     np.testing.assert_allclose(
-        bumps.images, np.sqrt(profile) * seen * scale[:, None, None], atol=1e-7
+        bumps.images(), np.sqrt(profile) * seen * scale[:, None, None], atol=1e-7
     )
     expected = gram * scale[:, None] * scale
     np.testing.assert_allclose(bumps.precision, expected, atol=1e-9)
     # one number each: the same covariance of the pixels
-    images = bumps.images.reshape(len(bumps.images), -1)
+    images = bumps.images().reshape(len(bumps), -1)
     pixels = [images, whitening_transform(bumps.precision) @ images]
     covariance = pixels[0].T @ np.linalg.pinv(bumps.precision, rcond=1e-8) @ pixels[0]
     largest = np.abs(covariance).max()
@@ -148,10 +148,10 @@ def test_bumps_may_be_only_where_light_is_shared():
     rows, columns = bumps.sides
     at = np.column_stack([side.argmax(1) for side in (rows, columns)]) - (row, column)
     wide = (columns / columns.max(1, keepdims=True) > 0.1).sum(1) > 11
-    assert 0 < wide.sum() < len(at) < len(SmoothModes(*given, shared).images) / 2
+    assert 0 < wide.sum() < len(at) < len(SmoothModes(*given, shared)) / 2
     assert (np.abs(at) < (5 + 2, 3 + 2)).all()
     between = (y == 18) & (x == 14)
-    assert not len(SmoothModes(*given, between, all_over=False).images)
+    assert not len(SmoothModes(*given, between, all_over=False))
 
 
 def test_bumps_of_large_galaxies_are_wider():
@@ -159,7 +159,7 @@ def test_bumps_of_large_galaxies_are_wider():
     profile = np.exp(-0.5 * ((y - 200) ** 2 + (x - 150) ** 2) / 60.0**2)
     shared = np.ones(profile.shape, bool)
     bumps = SmoothModes((0, 0), profile, np.full(3, 0.05), MultiscalePrior().kernels(), shared)
-    assert MAX_MODES / 8 < len(bumps.images) <= MAX_MODES
+    assert MAX_MODES / 8 < len(bumps) <= MAX_MODES
 
 
 @pytest.mark.parametrize("more", [0, 1])
@@ -167,6 +167,6 @@ def test_bumps_are_no_more_than_they_may_be(more, monkeypatch):
     y, x = np.indices((40, 30))
     profile = np.exp(-0.5 * ((y - 20) ** 2 + (x - 15) ** 2) / 6.0**2)
     given = (0, 0), profile, np.full(3, 0.05), MultiscalePrior().kernels(), np.ones((40, 30), bool)
-    n = len(SmoothModes(*given).images)
+    n = len(SmoothModes(*given))
     monkeypatch.setattr(room, "MAX_MODES", n - more)
-    assert (len(SmoothModes(*given).images) == n) == (not more)
+    assert (len(SmoothModes(*given)) == n) == (not more)

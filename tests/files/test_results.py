@@ -320,8 +320,8 @@ def test_damaged_and_newer_files_are_refused(tmp_path, monkeypatch):
         with pytest.raises(FileError) as error:
             read_result(path)
         assert "\n" not in str(error.value) and str(path) in str(error.value)
-    monkeypatch.setattr(store, "FORMAT", 7)
+    monkeypatch.setattr(store, "FORMAT", 8)
     write_result(path, result, overwrite=True)
     monkeypatch.undo()
-    with pytest.raises(FileError, match="format 7, this version reads 6"):
+    with pytest.raises(FileError, match="format 8, this version reads 7"):
         read_result(path)

@@ -39,10 +39,11 @@ class CellImages:
 class ModeImages:
     """Images (k, ny, nx) of a component's modes: smooth ones as CellImages, then sharp ones.
 
+    smooth: CellImages, those of one width after the other
     Like an array, it has len and shape, and is converted by np.asarray.
     """
 
-    smooth: CellImages
+    smooth: tuple[CellImages, ...]
     sharp: np.ndarray
 
     def __len__(self):
@@ -56,11 +57,16 @@ class ModeImages:
     @property
     def shape(self):
         """(k, ny, nx)."""
-        return len(self.smooth) + len(self.sharp), *self.sharp.shape[1:]
+        return sum(map(len, self.parts)), *self.sharp.shape[1:]
+
+    @property
+    def parts(self):
+        """All of them, in their order."""
+        return *self.smooth, self.sharp
 
     def __array__(self, dtype=None, copy=None):
-        smooth = self.smooth.on_pixels(self.smooth.values, self.shape[1:])
-        return np.concatenate([smooth, self.sharp]).astype(dtype or smooth.dtype, copy=False)
+        smooth = [part.on_pixels(part.values, self.shape[1:]) for part in self.smooth]
+        return np.concatenate([*smooth, self.sharp]).astype(dtype or self.dtype, copy=False)
 
 
 def cell_sums(values, pixel, *, n_axes=2, beyond="constant"):
@@ -81,9 +87,8 @@ def cell_sums(values, pixel, *, n_axes=2, beyond="constant"):
 def sums_with(modes, weights):
     """Sums (r, k) over pixels of modes (k, ny, nx), ModeImages or array, times weights."""
     if isinstance(modes, ModeImages):
-        parts = modes.smooth.values, modes.sharp
-        both = zip(parts, (modes.smooth.weights(weights), weights), strict=True)
-        return np.concatenate([sums_with(*pair) for pair in both], axis=1)
+        found = [sums_with(part.values, part.weights(weights)) for part in modes.smooth]
+        return np.concatenate([*found, sums_with(modes.sharp, weights)], axis=1)
     flat = weights.reshape(len(weights), -1).astype(modes.dtype, copy=False)
     return flat @ modes.reshape(len(modes), flat.shape[1]).T
 
@@ -91,9 +96,11 @@ def sums_with(modes, weights):
 def subtract(modes, parts, image):
     """Subtracts parts (k,) times an image (ny, nx) from modes, ModeImages or array, in place."""
     if isinstance(modes, ModeImages):
-        m, pixel = len(modes.smooth), modes.smooth.pixel
-        subtract(modes.smooth.values, parts[:m], cell_sums(image, pixel) / pixel**2)
-        modes, parts = modes.sharp, parts[m:]
+        for cells in modes.smooth:
+            m, pixel = len(cells), cells.pixel
+            subtract(cells.values, parts[:m], cell_sums(image, pixel) / pixel**2)
+            parts = parts[m:]
+        modes = modes.sharp
     modes -= parts[:, None, None] * image
 
 
@@ -101,11 +108,12 @@ def combined(modes, values):
     """Images (..., ny, nx): values (..., k) times modes, ModeImages or an array (k, ny, nx)."""
     if not isinstance(modes, ModeImages):
         return np.tensordot(values, modes, 1)
-    m, many = len(modes.smooth), np.reshape(values, (-1, len(modes)))
-    wide = np.tensordot(many[:, :m], modes.smooth.values, 1)
-    found = modes.smooth.on_pixels(wide, modes.shape[1:])
-    found += np.tensordot(many[:, m:], modes.sharp, 1)
-    return found.reshape(*np.shape(values)[:-1], *modes.shape[1:])
+    many, shape = np.reshape(values, (-1, len(modes))), modes.shape[1:]
+    *wide, own = np.split(many, np.cumsum([len(part) for part in modes.smooth]), axis=1)
+    found = np.tensordot(own, modes.sharp, 1)
+    for part, some in zip(modes.smooth, wide, strict=True):
+        found += part.on_pixels(np.tensordot(some, part.values, 1), shape)
+    return found.reshape(*np.shape(values)[:-1], *shape)
 
 
 def from_cells(n, pixel):

@@ -91,9 +91,9 @@ def normal_matrix(scene, exposures, images, spectra, layout, smooth=None) -> Blo
     scene: Scene; exposures: an AlignedObservation of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
     spectra (n, C), in the views' units
-    smooth (n): CellImages of modes that come before those of `images`, or None; all None by default
+    smooth (n): tuples of CellImages of modes that come before those of `images`; none by default
     """
-    smooth = [None] * len(images) if smooth is None else smooth
+    smooth = [()] * len(images) if smooth is None else smooth
     matrix = BlockMatrix(layout.sizes)
     for i, k in enumerate(layout.n_modes):
         matrix.block(i, i)[:k, :k] += np.eye(k)
@@ -190,8 +190,11 @@ class _NormalAccumulator:
                 continue
             spectrum = spectra[i, self.channels].astype(np.float32)
             own = [self._seen(i, images[i], spectrum, origin[i], low, high)]
-            if smooth[i] is not None:
-                own.append(self._seen_smooth(i, smooth[i], spectrum, origin[i], images[i].shape))
+            first = 0
+            for part in smooth[i]:
+                given = spectrum, origin[i], images[i].shape
+                own.append(self._seen_smooth(i, first, part, *given))
+                first += len(part)
             for one in own:
                 near.append(one)
                 both = [(other, one) if other.i <= i else (one, other) for other in near]
@@ -218,12 +221,13 @@ class _NormalAccumulator:
         seen[:, 1:] *= spectrum[:, None, None, None]
         return _ComponentView(i, modes, low, high, seen, 1)
 
-    def _seen_smooth(self, i, images, spectrum, origin, shape):
+    def _seen_smooth(self, i, first, images, spectrum, origin, shape):
         exposure = self._in_cells(self.exposure.cell_for(images.pixel))
         low, high = exposure.window(origin, shape[1:])
         light = exposure.observe(images.values, i, origin, low, high, images.pixel)
         light *= spectrum[:, None, None, None]
-        return _ComponentView(i, slice(0, len(images)), low, high, light, 0, exposure.cell)
+        modes = slice(first, first + len(images))
+        return _ComponentView(i, modes, low, high, light, 0, exposure.cell)
 
     def _in_cells(self, cell):
         """The observation in cells, made once."""

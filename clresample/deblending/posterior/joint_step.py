@@ -157,11 +157,12 @@ def _moves(solution, i, shared, image):
     profile, strengths = scene.profile[i], solution.findings.strengths[i]
     given = scene.origin[i], profile, strengths, prior.kernels(), shared
     bumps = SmoothModes(*given, all_over=False, most=MAX_CHANGES)
-    keep = np.flatnonzero(solution.flux_change_sigma(i, bumps.images) > MIN_CHANGE)
+    images = bumps.images()
+    keep = np.flatnonzero(solution.flux_change_sigma(i, images) > MIN_CHANGE)
     if not len(keep):
         return None, image
     weights = whitening_transform(bumps.precision[np.ix_(keep, keep)])
-    changes = np.tensordot(weights.astype(np.float32), bumps.images[keep], 1)
+    changes = np.tensordot(weights.astype(np.float32), images[keep], 1)
     solution.remove_profile_part(i, changes)
     rows, columns = bumps.sides
     both = [tuple(kernel_rows(prior, j, n) for n in profile.shape) for j in range(len(strengths))]

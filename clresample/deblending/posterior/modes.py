@@ -150,27 +150,36 @@ class Solution:
         )
         scatter = scatter / self.peaks[i]
         far *= np.append(1 / self.peaks[i], scatter)
-        n_own, smooth = 0, None
+        groups, smooth = [], []
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
             least = min(MIN_LIGHT, FAINTEST / max(self._peaks[i], 1e-30))
             given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
-            bumps = SmoothModes(*given, least_light=least, in_cells=True)
-            change = self.flux_change_sigma(i, bumps.images, bumps.pixel)
-            keep = np.flatnonzero(change > MIN_CHANGE)
-            own = whitening_transform(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
-            if bumps.pixel > 1:
-                smooth = np.empty((len(keep), *bumps.images.shape[1:]), np.float32)
-            else:
-                n_own = len(keep)
-        seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
-        seen[0], out = flush_faint(self.morphs[i].copy()), seen[1:]
-        if not scene.fixed[i]:
-            _combine(bumps.images, keep, own, out[:n_own] if smooth is None else smooth)
-        out[n_own:] = flush_faint(scatter[:, None, None] * images)
-        modes = out if smooth is None else ModeImages(CellImages(smooth, bumps.pixel), out)
+            groups = self._smooth_modes(i, SmoothModes(*given, least_light=least))
+            smooth = [CellImages(*group) for group in groups if group[1] > 1]
+        sharp = [group for group, pixel in groups if pixel == 1]
+        sharp.append(flush_faint(scatter[:, None, None] * images).astype(np.float32))
+        seen = np.concatenate([flush_faint(self.morphs[i].copy())[None], *sharp], dtype=np.float32)
+        modes = ModeImages(tuple(smooth), seen[1:]) if smooth else seen[1:]
         beyond = gauged(far, self.along(i, modes) * self.peaks[i])
         return seen, modes, beyond, self._held(i, modes)
+
+    def _smooth_modes(self, i, bumps):
+        """Independent combinations of smooth modes, [(images (k, my, mx), pixel)], see SmoothModes.
+
+        Those of wider ones come first, on their own pixels.
+        """
+        groups = bumps.groups()
+        images = [bumps.images(pixel, last) for _, last, pixel in groups]
+        pairs = list(zip(groups, images, strict=True))
+        change = [self.flux_change_sigma(i, own[first:], pixel) for (first, _, pixel), own in pairs]
+        keep = np.flatnonzero(np.concatenate(change) > MIN_CHANGE)
+        weights = whitening_transform(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
+        found = []
+        for (first, last, pixel), own in pairs:
+            a, b = np.searchsorted(keep, (first, last))
+            found.append((_combined(own, keep[:b], weights[a:b, :b]), pixel))
+        return found
 
     def remove_profile_part(self, i, images):
         """Subtracts the profile's part from images, in place; returns the parts (k,).
@@ -267,10 +276,12 @@ def gauged(sums, along):
     return out
 
 
-def _combine(images, keep, weights, out):
-    """Writes combinations of the images `keep`, weights (k, k) 0 above the diagonal, to `out`."""
+def _combined(images, keep, weights):
+    """Combinations (m, ny, nx) of the images `keep` (k,); weights (m, k), 0 above the diagonal."""
+    out, weights = images[keep], weights.astype(np.float32)
+    if len(weights) < len(keep):
+        return np.tensordot(weights, out, 1)
     if len(keep):
-        np.take(images, keep, axis=0, out=out, mode="clip")  # others take a copy first
         # the transpose, since BLAS counts rows first; in place
-        flat = out.reshape(len(out), -1)
-        strmm(1.0, weights.astype(np.float32).T, flat.T, side=1, overwrite_b=1)
+        strmm(1.0, weights.T, out.reshape(len(out), -1).T, side=1, overwrite_b=1)
+    return out

@@ -62,7 +62,7 @@ class Posterior:
         self.solution = solution
         found = zip(*(solution.modes(i) for i in range(n)), strict=True)
         images, self.modes, self.beyond, held = found
-        smooth = [m.smooth if isinstance(m, ModeImages) else None for m in self.modes]
+        smooth = [m.smooth if isinstance(m, ModeImages) else () for m in self.modes]
         self.layout = UnknownLayout(
             np.array([len(m) for m in self.modes]),
             n_channels,

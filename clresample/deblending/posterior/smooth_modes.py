@@ -47,14 +47,15 @@ TINY = 1e-10
 class SmoothModes:
     """Modes on the box of one component, on a grid aligned with the frame, which neighbours share.
 
-    images (k, ny, nx), float32, or their means over cells of `pixel` [px] where that is not 1, see
-        mode_images.py; precision (k, k): Q^-1 of their coefficients, with a diagonal of 1
+    n_coarse: number of the wider ones, which come first; pixels (2,) [px]: that suffice for images
+        of these, and of the others
+    precision (k, k): Q^-1 of their coefficients, with a diagonal of 1
     sides: (k, ny) and (k, nx), whose products are the Gaussians y
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
         scales; kernels: its J kernels; shared (ny, nx): mask of the overlap; all_over: False =
         modes in the overlap only; most: largest number of modes, MAX_MODES by default;
-        least_light: see MIN_LIGHT; in_cells: True = on pixels as wide as PIXELS_A_SIGMA allows
+        least_light: see MIN_LIGHT
     """
 
     def __init__(
@@ -68,7 +69,6 @@ class SmoothModes:
         all_over=True,
         most=None,
         least_light=MIN_LIGHT,
-        in_cells=False,
     ):
         spacings, low = (COARSE_SPACING_PX, FINE_SPACING_PX), None
         while low is None or len(low) > (most or MAX_MODES):
@@ -81,8 +81,8 @@ class SmoothModes:
             low, high = (np.concatenate(part) for part in pairs)
             spacings = tuple(2 * h for h in spacings)
         rows, columns = axes
-        narrowest = spacings[int((low >= rows.fine.start).any())] // 2
-        self.pixel = max(1, narrowest // 2 // PIXELS_A_SIGMA) if in_cells else 1
+        self.n_coarse = int((low < rows.fine.start).sum())
+        self.pixels = tuple(max(1, h // 4 // PIXELS_A_SIGMA) for h in spacings)
         variance = np.square(strengths)
         gram = rows.gram[:, low[:, None], low] * columns.gram[:, high[:, None], high]
         precision = np.tensordot(variance, gram, 1)
@@ -90,17 +90,34 @@ class SmoothModes:
         precision = precision * scale[:, None] * scale
         self.precision = 0.5 * (precision + precision.T)
         along = (variance[:, None] * scale)[:, :, None] * rows.blurred[:, low]
-        across, amplitude = columns.blurred[:, high], np.sqrt(np.maximum(profile, 0))
-        if self.pixel > 1:
-            along, across = (
-                cell_sums(part, self.pixel, n_axes=1, beyond="edge") / self.pixel
-                for part in (along, across)
-            )
-            amplitude = cell_sums(amplitude, self.pixel) / self.pixel**2
-        along, across, amplitude = map(_without_faint, (along, across, amplitude))
-        self.images = along.transpose(1, 2, 0) @ across.transpose(1, 0, 2)
-        self.images *= amplitude
+        self._tables = along, columns.blurred[:, high], np.sqrt(np.maximum(profile, 0))
         self.sides = scale[:, None] * rows.values[low], columns.values[high]
+
+    def __len__(self):
+        return len(self.precision)
+
+    def images(self, pixel=1, last=None):
+        """Images (k, my, mx), float32, of the first `last` modes, or all: means over cells.
+
+        pixel [px]: of the cells, see mode_images.py
+        """
+        along, across, amplitude = self._tables
+        along, across = (
+            cell_sums(part[:, :last], pixel, n_axes=1, beyond="edge") / pixel
+            for part in (along, across)
+        )
+        amplitude = cell_sums(amplitude, pixel) / pixel**2
+        along, across, amplitude = map(_without_faint, (along, across, amplitude))
+        found = along.transpose(1, 2, 0) @ across.transpose(1, 0, 2)
+        found *= amplitude
+        return found
+
+    def groups(self):
+        """Modes that share pixels: (first, last, pixel) of those from first to last - 1."""
+        n, (wide, narrow) = self.n_coarse, self.pixels
+        if n in (0, len(self)) or wide == narrow:
+            return [(0, len(self), wide if n else narrow)]
+        return [(0, n, wide), (n, len(self), narrow)]
 
 
 def whitening_transform(precision):
