@@ -29,6 +29,12 @@ def test_a_galaxy_is_none(sigma):
     assert kinds(((*STAR[:2], sigma), FAINT)) == [ExtendedSource] * 2
 
 
+@pytest.mark.parametrize(("light", "kind"), [(1, ExtendedSource), (0, PointSource)])
+def test_a_galaxy_hardly_wider_than_the_psf_is_none(light, kind):
+    """By 4 %, as clearly as noise of this signal to noise allows."""
+    assert kinds(((STAR[0], (16_000, 25_000), 0.45 * light),)) == [kind]
+
+
 @pytest.mark.parametrize(("wrong", "kind"), [(1.02, PointSource), (1.15, ExtendedSource)])
 def test_the_psf_may_be_as_wrong_as_stated(wrong, kind):
     assert kinds((STAR,), psf_sigma=wrong * FWHM_SIGMA) == [kind]
