@@ -131,6 +131,7 @@ def _fit(arguments, scene, device):
     from ..deblending.blend import Blend
     from ..measurement.detection import detect_more
     from ..measurement.late_sources import fit_with_late_sources, look_settings
+    from ..sky.sources import grouped_with
 
     settings = _settings(arguments, scene.settings)
     given = {"device": device, "dtype": np.dtype(arguments.dtype)}
@@ -149,11 +150,12 @@ def _fit(arguments, scene, device):
         return [_deblend(arguments, "first look", blend, first, given) for blend in some]
 
     def find(blend, result):
-        more = ()
+        sources = blend.sources
         if looking:
-            more = detect_more(result, threshold=scene.threshold).sources
-            _progress(arguments, f"{len(more)} more sources found in the residuals")
-        return replace(blend, sources=blend.sources + more, shifts=result.shifts)
+            more = detect_more(result, threshold=scene.threshold)
+            sources = grouped_with(sources, more.sources, more.hosts)
+            _progress(arguments, f"{len(more.sources)} more sources found in the residuals")
+        return replace(blend, sources=sources, shifts=result.shifts)
 
     if not settings.max_iter or not (settings.fit_shifts is True or looking):
         return fit(blends)[0]

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from astropy import units as u
 
-from ..measurement.catalogue import SHAPES, describe_flags
+from ..measurement.catalogue import SHAPES, Flag, describe_flags
 from ..measurement.columns import Columns
 from ..measurement.photometry import whole_groups
 from ..sky.wcs import axis_names, celestial_frame
@@ -29,6 +29,7 @@ def finalise_catalogue(job, parts, last, unsettled=(), names=None):
         fits.append(patches.select_rows(mine))
     rows = Columns.concatenate(tables)
     whole_groups(rows, job.bands)
+    rows["flags"][rows["n_group"] > 1] |= Flag.GROUP
     rows = rows.select_rows(np.argsort(rows["id"], kind="stable"))
     at = np.stack([rows["y"], rows["x"]], axis=1)
     rows = rows.select_rows(job.core.contains(at))

@@ -18,6 +18,7 @@ from ..deblending.posterior.residuals import channel_residuals
 from ..deblending.result import Result
 from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
+from ..sky.sources import group_rows
 from ..sky.validation.checks import check_instance
 from ..sky.wcs import axis_names, celestial_frame, local_axes
 from .columns import Columns, definition
@@ -50,6 +51,7 @@ class Flag(IntFlag):
     MISFIT = 64
     SATURATED = 128
     AMBIGUOUS = 256
+    GROUP = 512
 
     @classmethod
     def _missing_(cls, value):
@@ -69,6 +71,7 @@ FLAG_MEANINGS = {
     Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
     Flag.MISFIT: "the model leaves over 5 sigma (4 beside a point) and over 3 % of the flux",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
+    Flag.GROUP: "one of several sources that may be pieces of one galaxy, whose flux is group_flux",
 }
 
 
@@ -77,7 +80,8 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
 
     result: a fitted blend; magnitudes: add the columns of magnitudes and colours of bands that have
         zero points
-    groups (S,): a number for each group of sources, as `Detection.groups`: adds their columns
+    groups (S,): a number for each group of sources, as `Detection.groups`; None = by the `group` of
+        the sources, if any is in one
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
@@ -105,8 +109,9 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of neighbouring bands A and B; the error
             follows from the covariance of the two fluxes to first order, see
             `channel_covariances`, and is valid if both are detected
-        group_id, n_group: number of the group, and its sources; group_flux_*, group_flux_err_* per
-            channel: of all of them together, the error with the covariances of their fluxes
+        group_id, n_group: number of the group (of its first row, where sources have it), and its
+            sources; group_flux_*, group_flux_err_* per channel: of all of them together, the error
+            with the covariances of their fluxes. Without groups there are no such columns
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         max_residual_* per channel [sigma]: the largest residual on the source once filtered with
@@ -169,9 +174,12 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
             _add_magnitudes(table, band, flux[:, i] * to_ujy, error[:, i] * to_ujy)
     if magnitudes:
         _add_colours(table, result, flux, bands or list(result.bands))
+    if groups is None and any(source.group is not None for source in result.sources):
+        groups = group_rows(result.sources)
     if groups is not None:
         table.put("group_id", np.asarray(groups))
         add_groups(table, result, flux, covariance, groups)
+        table["flags"][table["n_group"] > 1] |= Flag.GROUP
     for i, label in enumerate(observation_labels(result)):
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     for channel, values in zip(result.channels, worst.T, strict=True):

@@ -9,15 +9,19 @@ is its symmetric model, and the image minus the sum of all these models is searc
 may also be a clump of the galaxy itself. Two criteria distinguish them: clumps lie on the galaxy's
 light, and have its colours. A peak h is a source of its own if
 
-    h >= c(r) sqrt(H (m + 1)),   or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
+    h >= c(r) sqrt(H (m + 1)),   or   h >= CLUMP_PART F max(1, MAX_BY_CHANCE / n(r)),
+    or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
 
-where H is the galaxy's peak and m its light there, all in sigma, r is the distance from its centre
+where H is the galaxy's peak, m its light there and F all of its light as the peak of a point, all
+in sigma, r is the distance from its centre, n the number of sources within it by chance (clumps.py)
 and c(r) = CLUMP r / CLUMP_ARCSEC, limited to MIN_CLUMP and MAX_CLUMP. If a clump's light were a
 fraction of the galaxy's, the threshold would scale with H; if it were a fraction of the local
 light, with m. The mean of both, sqrt(H m), separates neighbours from clumps better than either.
-c(r) grows
-outwards: near the centre the symmetric model contains part of the neighbour, so that less of it is
-left; far out a single clump, whose opposite side is empty, is left whole. Galaxies are also wider
+c(r) grows outwards: near the centre the symmetric model contains part of the neighbour, so that
+less of it is left; far out a single clump, whose opposite side is empty, is left whole. The second
+condition counts under wide PSFs, where F is a few H and neighbours are seen at distances at which
+they are more frequent than clumps: without it a neighbour of a fifth of the light of a galaxy of
+signal to noise 300 is first found at 3 PSF widths, with it at 1.9. Galaxies are also wider
 than clumps, so a neighbour must also be left under the filter of small galaxies.
 
 Source: the symmetry, Lupton et al. 2005 (SDSS's deblender) and Melchior et al. 2018 (Astronomy and
@@ -27,6 +31,9 @@ Computing 24, 129).
 from __future__ import annotations
 
 import numpy as np
+
+from .clumps import CHANCE, CLUMP_PART, MAX_BY_CHANCE
+from .peaks import POINT_AREA
 
 # Chosen on forty simulated fields of 1024 pixels (4000 sources); results on other fields are in
 # docs/fields.md. With larger values neighbours are lost, with smaller ones clumps become sources.
@@ -54,7 +61,9 @@ UNSEEN = 1e30  # [sigma] value of unobserved pixels: the minimum is then that of
 
 
 def symmetric_residual(image, seen, positions):
-    """Residual of an image after symmetric models of sources, and the sum of these: (Ny, Nx).
+    """Residual of an image after symmetric models of sources, the sum of these, both (Ny, Nx).
+
+    Also returned is all light (S,) of each.
 
     image (Ny, Nx) [sigma]; seen (Ny, Nx) bool; positions (S, 2) [px]: centres, to part of a pixel
     """
@@ -64,8 +73,8 @@ def symmetric_residual(image, seen, positions):
     brightest = image[seen].max(initial=0)  # interpolated beside a hole, light is up to UNSEEN
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
     radii = np.arange(REACH_PX + 1.0)[:, None]
-    total = np.zeros(image.shape, np.float32)
-    for y, x in positions:
+    total, lights = np.zeros(image.shape, np.float32), np.zeros(len(positions))
+    for i, (y, x) in enumerate(positions):
         at = y + radii * np.sin(angles), x + radii * np.cos(angles)
         if seen[round(y), round(x)]:
             rings = map_coordinates(light, at, order=1, cval=UNSEEN)
@@ -84,8 +93,10 @@ def symmetric_residual(image, seen, positions):
         turn = np.arctan2(dy, dx) / (2 * np.pi) * N_ANGLES % N_ANGLES
         around = np.concatenate([rings, rings[:, :1]], axis=1)
         own = map_coordinates(around, [np.minimum(radius, REACH_PX), turn], order=1)
-        total[low[0] : high[0], low[1] : high[1]] += own * (radius <= reach)
-    return np.where(seen, image - total, 0.0), total
+        own *= radius <= reach
+        total[low[0] : high[0], low[1] : high[1]] += own
+        lights[i] = own.sum()
+    return np.where(seen, image - total, 0.0), total, lights
 
 
 def residual_scatter(model):
@@ -130,12 +141,14 @@ def local_level(rest, place, radius):
     return max(float(np.median(window)), 0.0)
 
 
-def is_a_source(place, height, model, image, signals, centres, fwhm, scale, *, coloured=False):
+def is_a_source(
+    place, height, model, lights, image, signals, centres, fwhm, scale, *, coloured=False
+):
     """Returns True if a residual peak is a source of its own, by this module's criteria.
 
     place (2,) ints: (y, x) of the peak; height [sigma]: of the residual there, from
         `brightest_peak_near`
-    model, image (Ny, Nx) [sigma]: models, what was searched
+    model, lights, image: models (Ny, Nx) [sigma] together, the sum (S,) of each; what was searched
     signals: SignalToNoise of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
     coloured: its spectrum must be another
@@ -147,7 +160,10 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale, *, c
     host = np.argmax(np.log(heights) - away / fwhm)  # brightest if light falls by e per FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
     part = CLUMP * away[host] * scale / CLUMP_ARCSEC
-    if not coloured and height >= np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump:
+    by_chance = CHANCE * np.pi * (away[host] * scale) ** 2
+    most = CLUMP_PART * max(1.0, MAX_BY_CHANCE / max(by_chance, 1e-9))
+    most *= lights[host] / (POINT_AREA * fwhm**2)
+    if not coloured and height >= min(np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump, most):
         return True
     if height < COLOURED * clump:
         return False

@@ -68,7 +68,7 @@ class Detection(ShownDetection):
     """Sources that `detect` or `detect_more` found, S of them, stars first, brightest peak first.
 
     sources (S,): first a free PointSource for each star with a saturated or masked core, see
-        star_light.py, then ExtendedSource
+        star_light.py, then ExtendedSource; those that may be pieces of one galaxy have its `group`
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
@@ -317,8 +317,13 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
     ]
     heights = [peak_beside(everything, star) for star in stars]
+    several = np.bincount(groups, minlength=len(groups))[groups] > 1
+    galaxies = [
+        ExtendedSource(position_px=position, group=int(group) if one_of_several else None)
+        for position, group, one_of_several in zip(positions, groups, several, strict=True)
+    ]
     return Detection(
-        sources=(*points, *(ExtendedSource(position_px=position) for position in positions)),
+        sources=(*points, *galaxies),
         frame=frame,
         peaks=np.array([*heights, *(found.peaks[i] for i in order)]),
         found_in=(*(ALL for _ in stars), *(found.labels[i] for i in order)),
@@ -340,8 +345,8 @@ def _companions(sep, signals, one, everything, places, threshold, fwhm, scale, *
             for p in places
         ]
     )
-    rest, model = symmetric_residual(image, seen, centres)
-    wide, _ = symmetric_residual(signals[one].flat(SMALL_GALAXY), seen, centres)
+    rest, model, lights = symmetric_residual(image, seen, centres)
+    wide, *_ = symmetric_residual(signals[one].flat(SMALL_GALAXY), seen, centres)
     noise = residual_scatter(model)
     new = new_peaks(
         sep,
@@ -365,7 +370,7 @@ def _companions(sep, signals, one, everything, places, threshold, fwhm, scale, *
             continue
         if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:
             continue
-        given = model, image, signals, centres, fwhm, scale
+        given = model, lights, image, signals, centres, fwhm, scale
         if is_a_source(at, height, *given, coloured=coloured):
             found.append((top, height))
     return found

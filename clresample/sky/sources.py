@@ -30,6 +30,8 @@ class Source:
         footprints (see `model_frame`), whose first pixel few users know: pass the frame too, or
         the observation's name
     name: its name in the catalogue, unique in a fit; None = its number
+    group: number of the sources that may be pieces of one galaxy with it, as `detect` gives it; the
+        catalogue then has their total fluxes too. None = it is no piece
     sky_frame: "icrs" where sky_deg was a SkyCoord; None = numbers in the frame of the grid's WCS
 
     Raises ValueError unless there is exactly one position, which must be finite, and for an
@@ -41,8 +43,11 @@ class Source:
     observation: str | None = None
     name: str | None = None
     sky_frame: str | None = None
+    group: int | None = None
 
     def __post_init__(self):
+        if self.group is not None:
+            check_integer("group", self.group)
         if (self.sky_deg is None) == (self.position_px is None):
             raise ValueError(
                 "a source takes either sky_deg or position_px, "
@@ -169,6 +174,29 @@ class ExtendedSource(Source):
             )
         if not profile.any():
             raise ValueError("profile is zero everywhere")
+
+
+def group_rows(sources) -> list[int]:
+    """Number of the first source of each one's group, its own where it is in none."""
+    first: dict = {}
+    return [i if s.group is None else first.setdefault(s.group, i) for i, s in enumerate(sources)]
+
+
+def grouped_with(sources, more, hosts) -> tuple:
+    """Sources and more of them, in the groups of their hosts.
+
+    hosts (k,): number of the source of which each one of `more` may be a piece, -1 for none
+    """
+    found = list(sources)
+    for source, host in zip(more, hosts, strict=True):
+        if host >= 0:
+            group = found[host].group
+            if group is None:
+                group = 1 + max((s.group for s in found if s.group is not None), default=-1)
+                found[host] = replace(found[host], group=group)
+            source = replace(source, group=group)
+        found.append(source)
+    return tuple(found)
 
 
 def is_open(source) -> bool:

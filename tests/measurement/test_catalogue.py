@@ -1,5 +1,7 @@
 """A catalogue's names, flags, and sources that were not fitted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -19,7 +21,7 @@ from clresample.measurement.photometry import redistribute
 from clresample.measurement.quality import summary
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
-from clresample.sky.sources import ExtendedSource, PointSource
+from clresample.sky.sources import ExtendedSource, PointSource, group_rows, grouped_with
 
 
 def test_names_and_frame_are_those_of_the_wcs():
@@ -157,6 +159,32 @@ def test_no_coverage_is_a_centre_off_an_image():
     assert flags(one_source((30, 33), observations=[full, left])) == [Flag(0)]
     moved = np.array([[0, 0], [0, 3.0]])  # its pixels lie 3 px further right than its WCS says
     assert flags(one_source(observations=[full, left], shifts=moved)) == [Flag(0)]
+
+
+def test_sources_of_one_group_have_its_flux_and_a_flag():
+    """By default of their own groups; sources without any have rows of their own."""
+    places = ((30, 20), (30, 28), (30, 44))
+    components = [round_component(i, place, (1.0 + i, 2.0)) for i, place in enumerate(places)]
+    result = blend(components)
+    assert "group_id" not in catalogue(result).colnames
+    own = [replace(s, group=g) for s, g in zip(result.sources, (None, 7, 7), strict=True)]
+    table = catalogue(replace(result, sources=tuple(own)))
+    assert list(table["group_id"]) == [0, 1, 1] and list(table["n_group"]) == [1, 2, 2]
+    assert [Flag(f) & Flag.GROUP for f in table["flags"]] == [Flag(0), Flag.GROUP, Flag.GROUP]
+    flux, total = table["flux_g"].value, table["group_flux_g"].value
+    np.testing.assert_allclose(total, [flux[0], flux[1] + flux[2], flux[1] + flux[2]])
+    given = catalogue(result, groups=[5, 1, 1])
+    np.testing.assert_array_equal(given["group_flux_g"], table["group_flux_g"])
+
+
+def test_late_sources_are_in_the_groups_of_their_hosts():
+    sources = [ExtendedSource(position_px=(1, i), group=g) for i, g in enumerate((None, 3, None))]
+    more = [ExtendedSource(position_px=(2, i)) for i in range(4)]
+    found = grouped_with(sources, more, [2, 1, -1, 2])
+    assert [s.group for s in found] == [None, 3, 4, 4, 3, None, 4]
+    assert group_rows(found) == [0, 1, 2, 2, 1, 5, 2]
+    with pytest.raises(ValueError, match="group is -1, must be 0 or more"):
+        ExtendedSource(position_px=(1, 1), group=-1)
 
 
 def test_numbers_of_groups_and_draws_are_checked():

@@ -14,6 +14,7 @@ from clresample.measurement.searched import Search
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
+from clresample.sky.sources import group_rows
 
 FWHM = 2.0
 SIZE = 120
@@ -130,10 +131,12 @@ def test_knots_of_a_small_galaxy_are_sources_in_its_group():
     assert found.owners.tolist() == [0, 0, -1] and not found.structure.any()
     assert found.group_at(np.array(knot), 100, 75) == 0
     assert found.group_at(np.array(knot), 1e5, 40) == found.group_at(np.array(far), 200, 1) == -1
+    wide = small_bodies_of(image, places, FWHM, 5.0, 0.2)  # where neighbours are more frequent
+    assert (wide.owners == -1).all() and wide.group_at(np.array(knot), 100, 75) == -1
     # a peak as bright is part of it where hardly any light is less bright between the two
     for twin, owners in (((60, 53), [0, 0]), ((60, 46), [-1, 0])):
         twins = disk(4) + disk(4, 380.0, twin)
-        found = small_bodies_of(twins, np.array([MIDDLE, twin]), FWHM, 5.0, 0.1)
+        found = small_bodies_of(twins, np.array([MIDDLE, twin]), FWHM, 5.0, 0.05)
         assert sorted(found.owners) == owners
 
 
@@ -202,6 +205,7 @@ def test_a_large_knotty_galaxy_is_one_group_and_a_field_of_light_is_no_limit():
     groups = set(found.groups.tolist())
     assert (found.image > 5).sum() > 300_000
     assert len(groups) < 6 and len(found.sources) < 25
+    assert [found.groups[i] for i in group_rows(found.sources)] == found.groups.tolist()
 
 
 def test_what_a_fit_leaves_of_a_large_galaxys_structure_is_no_source():

@@ -36,15 +36,16 @@ def rest_of(image, *places, seen=SEEN):
 
 def test_a_symmetric_source_leaves_little_and_its_model_is_its_light():
     image = spot((60.3, 58.6), 500, sigma=6, ratio=1.6)
-    rest, model = rest_of(image, (60.3, 58.6))
+    rest, model, light = rest_of(image, (60.3, 58.6))
     assert np.abs(rest).max() < 0.02 * 500
     assert (rest / residual_scatter(model)).max() < 5
     np.testing.assert_allclose(model.sum(), image.sum(), rtol=0.05)
+    assert light == pytest.approx(model.sum())
 
 
 def test_a_neighbour_on_the_flank_is_left_with_its_height():
     host, other = spot((60, 60), 300, sigma=4), spot((60, 68), 40)
-    rest, model = rest_of(host + other, (60, 60))
+    rest, model, _ = rest_of(host + other, (60, 60))
     peak = np.unravel_index(rest.argmax(), SHAPE)
     assert np.hypot(peak[0] - 60, peak[1] - 68) < 1.5
     assert rest.max() == pytest.approx(40, rel=0.15)
@@ -55,14 +56,15 @@ def test_a_side_that_was_not_seen_is_told_by_the_other():
     image = spot((60, 60), 300, sigma=4)
     seen = SEEN.copy()
     seen[:, 63:] = False
-    rest, model = rest_of(np.where(seen, image, 0), (60, 60), seen=seen)
+    rest, model, _ = rest_of(np.where(seen, image, 0), (60, 60), seen=seen)
     assert not rest[~seen].any()
     assert rest[seen].max() < 6 and model[60, 56] == pytest.approx(image[60, 56], rel=0.05)
     assert not rest_of(np.zeros(SHAPE), (60, 80), seen=seen)[1].any()
 
 
-def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
-    rest, model = rest_of(image, centre)
+def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE, light=np.inf):
+    """light: of the galaxy, by default too much for a neighbour to be told by its part of it."""
+    rest, model, _ = rest_of(image, centre)
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
     signals = [
         SignalToNoise(
@@ -70,8 +72,9 @@ def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
         )
     ]
     height = rest[tuple(place)]
-    centres = np.array([centre])
-    return is_a_source(np.array(place), height, model, image, signals, centres, FWHM, scale)
+    lights, centres = np.array([light]), np.array([centre])
+    given = model, lights, image, signals, centres, FWHM, scale
+    return is_a_source(np.array(place), height, *given)
 
 
 def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
@@ -94,6 +97,19 @@ def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away
         assert judge(image, both, (60, 76), scale=away_arcsec / 16) == is_one
 
 
+@pytest.mark.parametrize("away_arcsec, more", ((0.5, 0.1 / (0.025 * np.pi * 0.25)), (1.5, 1.0)))
+def test_what_has_a_part_of_all_light_is_a_source_where_clumps_are_rarer(away_arcsec, more):
+    """On light that would hide it otherwise, at any distance for which there is a chance of it."""
+    galaxy, part = spot((60, 60), 1000, sigma=4), 0.03 * more
+    light = 60 * 2.27 * FWHM**2  # of a point of height 60
+    for height, is_one in ((0.95 * part * 60, False), (1.05 * part * 60, True)):
+        image = galaxy + spot((60, 76), height)
+        both = np.stack([image, image])
+        given = {"scale": away_arcsec / 16, "light": light}
+        assert judge(image, both, (60, 76), **given) == is_one
+        assert not judge(image, both, (60, 76), scale=away_arcsec / 16)
+
+
 def test_centres_are_found_to_part_of_a_pixel():
     image = spot((60.3, 58.8), 100)
     np.testing.assert_allclose(parabolic_peak(image, (60, 59)), (60.3, 58.8), atol=0.05)
@@ -102,7 +118,7 @@ def test_centres_are_found_to_part_of_a_pixel():
 
 def test_the_top_of_what_is_left_is_nearer_than_its_peak_in_units_of_the_noise():
     image = spot((60, 60), 400, sigma=4) + spot((60.4, 67.2), 90)
-    rest, model = rest_of(image, (60, 60))
+    rest, model, _ = rest_of(image, (60, 60))
     peak = np.unravel_index((rest / residual_scatter(model)).argmax(), SHAPE)
     place, height = brightest_peak_near(rest, peak, 2)
     away, before = (np.hypot(*(np.array(p) - (60.4, 67.2))) for p in (place, peak))
@@ -141,5 +157,5 @@ def test_a_neighbour_is_seen_under_the_filter_of_small_galaxies_too(monkeypatch)
 def test_a_centre_beside_unseen_pixels_has_at_most_the_light_that_was_seen():
     image, seen = spot((60.3, 58.6), 500, sigma=6), SEEN.copy()
     seen[61:, :60] = False
-    rest, model = rest_of(image, (60.3, 58.6), seen=seen)
+    rest, model, _ = rest_of(image, (60.3, 58.6), seen=seen)
     assert model.max() <= image.max() and np.abs(rest[seen]).max() < 0.02 * 500

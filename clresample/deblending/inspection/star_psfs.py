@@ -169,7 +169,7 @@ def replace_by_stars(sources, numbers, still):
     """
     found = list(sources)
     for i in numbers:
-        keys = ("sky_deg", "position_px", "observation", "name", "sky_frame")
+        keys = ("sky_deg", "position_px", "observation", "name", "sky_frame", "group")
         given = {key: getattr(sources[i], key) for key in keys}
         free = i not in still and getattr(sources[i], "free_position", True)
         found[i] = PointSource(**given, free_position=free)
