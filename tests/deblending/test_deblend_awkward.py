@@ -43,7 +43,7 @@ def test_a_source_outside_is_reported_and_left_out(device):
     assert [c.source for c in result.components] == [0, 2]
     assert len(result.messages) == 1
     assert result.messages[0].startswith(
-        "a source lies outside the model frame: source 1 at [15.  35.6]"
+        "a source lies outside the model frame: source 1 at (y, x) = (15.0, 35.6) [px]"
     )
     assert not np.any(result.source_model(1))
     same(result, fit(b, device, settings=EXACT))

@@ -43,7 +43,7 @@ def test_sources_outside_the_frame_are_named():
     inside, messages = fit_module._inside(home, np.array([(3.0, 4.0), (30.0, 4.0)]))
     assert inside.tolist() == [True, False] and len(messages) == 1
     assert (
-        messages[0].startswith("a source lies outside the model frame: source 1 at [30.")
+        messages[0].startswith("a source lies outside the model frame: source 1 at (y, x) = (30.0,")
         and "(30, 36)" in messages[0]
     )
     with pytest.raises(ValueError, match=r"none of the 2 sources lies inside .* \(30, 36\)"):
