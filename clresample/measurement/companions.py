@@ -159,11 +159,11 @@ def is_a_source(
     away = np.hypot(*(centres - place).T)
     host = np.argmax(np.log(heights) - away / fwhm)  # brightest if light falls by e per FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
-    part = CLUMP * away[host] * scale / CLUMP_ARCSEC
-    by_chance = CHANCE * np.pi * (away[host] * scale) ** 2
-    most = CLUMP_PART * max(1.0, MAX_BY_CHANCE / max(by_chance, 1e-9))
-    most *= lights[host] / (POINT_AREA * fwhm**2)
-    if not coloured and height >= min(np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump, most):
+    distance = away[host] * scale
+    most = np.clip(CLUMP * distance / CLUMP_ARCSEC, MIN_CLUMP, MAX_CLUMP) * clump
+    by_chance = max(CHANCE * np.pi * distance**2, 1e-9)
+    part = CLUMP_PART * max(1.0, MAX_BY_CHANCE / by_chance)
+    if not coloured and height >= min(most, part * lights[host] / (POINT_AREA * fwhm**2)):
         return True
     if height < COLOURED * clump:
         return False
