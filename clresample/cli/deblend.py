@@ -131,7 +131,7 @@ def _fit(arguments, scene, device):
     from ..deblending.blend import Blend
     from ..measurement.detection import detect_more
     from ..measurement.late_sources import fit_with_late_sources, look_settings
-    from ..sky.sources import grouped_with
+    from ..sky.sources import join_groups
 
     settings = _settings(arguments, scene.settings)
     given = {"device": device, "dtype": np.dtype(arguments.dtype)}
@@ -153,7 +153,7 @@ def _fit(arguments, scene, device):
         sources = blend.sources
         if looking:
             more = detect_more(result, threshold=scene.threshold)
-            sources = grouped_with(sources, more.sources, more.hosts)
+            sources = join_groups(sources, more.sources, more.hosts)
             _progress(arguments, f"{len(more.sources)} more sources found in the residuals")
         return replace(blend, sources=sources, shifts=result.shifts)
 

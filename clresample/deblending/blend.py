@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..sky.frame import Frame, model_frame
+from ..sky.frame import Frame, grow_to_sources, model_frame
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source, check_unique_names
 from ..sky.validation.checks import as_float_array, check_instance, check_sequence
@@ -21,10 +21,6 @@ MAX_COMPONENTS, MAX_BYTES, MAX_PIXELS = 2000, 8 << 30, 1 << 24
 # [bytes] Memory of a fit for each pixel of a component's box, for bright galaxies, and for each
 # pixel of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
 BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
-# [FWHM of the widest PSF] Distance from the images up to which listed sources are fitted, since
-# their light is in these; and from them to the frame's edge. Without them four galaxies beside such
-# ones had 0.01 to 0.72 of their flux, at up to 4 errors and without a flag.
-BESIDE_FWHM, MARGIN_FWHM = 3.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -32,8 +28,8 @@ class Blend:
     """One patch of sky: its observations and its sources.
 
     observations: at least one Observation; sources: PointSource and ExtendedSource
-    frame: the model's Frame; None = `model_frame` of the observations, and room for sources up to
-        3 FWHM of the widest PSF outside of them, unless positions or profiles are on its pixels
+    frame: the model's Frame; None = `model_frame` of the observations, grown as `grow_to_sources`
+        does if a source lies just outside
     shifts (n_observations, 2) [model px]: of the observations' pixels, if known; a fit of shifts
         starts from them. If a fit finds a shift of more than a pixel, start a second fit from it,
         because the profiles of the first came from images that disagreed
@@ -123,25 +119,6 @@ class Blend:
             raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
         return shifts
 
-    def _with_sources_beside(self, frame):
-        """The frame grown to the listed sources that lie just outside of it."""
-        by_sky = all(s.sky_deg is not None or s.observation is not None for s in self.sources)
-        drawn = any(getattr(s, "profile", None) is not None for s in self.sources)
-        if not by_sky or drawn or self.structures:
-            return frame
-        widths = [o.psf.fwhm_px.max() * o.grid.pixel_scale_arcsec for o in self.observations]
-        width, last = max(widths) / frame.grid.pixel_scale_arcsec, np.array(frame.shape) - 1
-        at = frame.positions_of(self.sources, self.observations, self.initial_shifts())
-        away = np.hypot(*np.maximum(np.maximum(-at, at - last), 0).T)
-        beside = at[(away <= BESIDE_FWHM * width) & ~frame.contains(at)]
-        if not len(beside):
-            return frame
-        margin, low, high = MARGIN_FWHM * width, beside.min(axis=0), beside.max(axis=0)
-        low = np.where(low < -0.5, np.floor(low - margin), 0).astype(int)
-        high = np.where(high > last + 0.5, np.ceil(high + margin), last).astype(int)
-        shape = tuple((high - low + 1).tolist())
-        return Frame(frame.grid.cutout(*low.tolist(), shape), frame.psf)
-
     def resolve_frame(self) -> Frame:
         """The frame of the blend, checked; see the class for that of one without.
 
@@ -155,7 +132,9 @@ class Blend:
                 "nothing to fit; list sources, or pass detect a lower threshold"
             )
         if self.frame is None:
-            frame = self._with_sources_beside(model_frame(self.observations))
+            frame = model_frame(self.observations)
+            grown = grow_to_sources(frame, self.observations, self.sources, self.initial_shifts())
+            frame = grown if np.prod(grown.shape, dtype=float) <= MAX_PIXELS else frame
         else:
             check_observations(self.observations)
             frame = self.frame

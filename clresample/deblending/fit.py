@@ -278,7 +278,7 @@ def _inside(frame, positions, sources=()):
         )
     return inside, [
         f"a source lies outside the model frame: source {i} at (y, x) = ({p[0]:.1f}, {p[1]:.1f}) "
-        f"[px] of {frame.shape}; its light in the images goes to others: pass a larger frame"
+        f"[px] of {frame.shape}; if its light is in the images, pass a larger frame"
         for i, p in enumerate(positions)
         if not inside[i]
     ]

@@ -12,7 +12,7 @@ from ..deblending.linear.ties import Ties
 from ..deblending.posterior.errors import FluxChanges, PosteriorSampler
 from .array_hdus import array_of, image_hdu
 
-NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel", "n_narrow", "narrow_pixel")
+NODES = ("n_modes", "size", "order", "n_later", "n_smooth", "pixel", "n_smooth_2", "pixel_2")
 
 
 def draw_hdus(draws):

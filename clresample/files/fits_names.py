@@ -7,7 +7,7 @@ from itertools import pairwise
 # Characters of a column's name, or of a text on one card, that FITS takes; an apostrophe is written
 # as two.
 COLUMN = 68
-MAX_CHARACTERS = COLUMN - len("flux_err_")  # of channels, whose longest column that is
+MAX_CHARACTERS = COLUMN - len("group_flux_err_")  # of channels, whose longest column that is
 
 
 def to_ascii(text):

@@ -71,7 +71,7 @@ FLAG_MEANINGS = {
     Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
     Flag.MISFIT: "the model leaves over 5 sigma (4 beside a point) and over 3 % of the flux",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
-    Flag.GROUP: "one of several sources that may be pieces of one galaxy, whose flux is group_flux",
+    Flag.GROUP: "one of several sources that may be pieces of one galaxy: group_flux_* is of all",
 }
 
 
@@ -174,11 +174,13 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
             _add_magnitudes(table, band, flux[:, i] * to_ujy, error[:, i] * to_ujy)
     if magnitudes:
         _add_colours(table, result, flux, bands or list(result.bands))
-    if groups is None and any(source.group is not None for source in result.sources):
+    own_groups = groups is None and any(s.group is not None for s in result.sources)
+    if own_groups:
         groups = group_rows(result.sources)
     if groups is not None:
         table.put("group_id", np.asarray(groups))
         add_groups(table, result, flux, covariance, groups)
+    if own_groups:
         table["flags"][table["n_group"] > 1] |= Flag.GROUP
     for i, label in enumerate(observation_labels(result)):
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))

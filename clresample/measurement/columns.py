@@ -36,7 +36,7 @@ DEFINITIONS = definitions(
         "name": ("of the source: its own, or its number; in a field that of the list", None, "U"),
         "id": ("of the source: field, row, column of the model's pixel at it", None, np.int64),
         "parent_id": ("id of the brightest source detected in the same blend", None, np.int64),
-        "group_id": ("id of the brightest source of its group, or its own", None, np.int64),
+        "group_id": ("of its group: its first row, in a field its brightest id", None, np.int64),
         "n_group": ("sources of the group", None, np.int32),
         "flags": ("sum of what limits the measurement", None, np.int32),
         "status": ("how the fit ended", None, "U"),

@@ -163,7 +163,9 @@ def is_a_source(
     most = np.clip(CLUMP * distance / CLUMP_ARCSEC, MIN_CLUMP, MAX_CLUMP) * clump
     by_chance = max(CHANCE * np.pi * distance**2, 1e-9)
     part = CLUMP_PART * max(1.0, MAX_BY_CHANCE / by_chance)
-    if not coloured and height >= min(most, part * lights[host] / (POINT_AREA * fwhm**2)):
+    # at least that of a point, as of a source that this image hardly shows
+    light = max(lights[host] / (POINT_AREA * fwhm**2), heights[host], model[at])
+    if not coloured and height >= min(most, part * light):
         return True
     if height < COLOURED * clump:
         return False

@@ -209,7 +209,7 @@ def _without_structure(result, found, known, places, threshold):
             is_structure, is_member = body.takes(rest[y, x], light[y, x])
         if not is_structure:
             kept.append(i)
-            host = np.hypot(*(known - body.center).T).argmin() if is_member else -1
+            host = np.nanargmin(np.hypot(*(known - body.center).T)) if is_member else -1
             hosts.append(int(host))
     return replace(_chosen(found, kept), hosts=np.array(hosts, int))
 
@@ -317,10 +317,11 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
     ]
     heights = [peak_beside(everything, star) for star in stars]
-    several = np.bincount(groups, minlength=len(groups))[groups] > 1
+    groups = groups + len(stars)
+    counts = np.bincount(groups, minlength=1)
     galaxies = [
-        ExtendedSource(position_px=position, group=int(group) if one_of_several else None)
-        for position, group, one_of_several in zip(positions, groups, several, strict=True)
+        ExtendedSource(position_px=position, group=int(group) if counts[group] > 1 else None)
+        for position, group in zip(positions, groups, strict=True)
     ]
     return Detection(
         sources=(*points, *galaxies),
@@ -328,7 +329,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         peaks=np.array([*heights, *(found.peaks[i] for i in order)]),
         found_in=(*(ALL for _ in stars), *(found.labels[i] for i in order)),
         image=everything,
-        groups=np.concatenate([np.arange(len(stars)), groups + len(stars)]),
+        groups=np.concatenate([np.arange(len(stars)), groups]),
     )
 
 

@@ -16,7 +16,6 @@ from ..deblending.blend import Blend
 from ..deblending.solver.boxes import Boxes
 from ..device.device import get_device
 from ..resampling.resampler import Resampler
-from ..sky.frame import model_frame
 from ..sky.sources import ExtendedSource
 from ..sky.validation.checks import check_instance
 from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain
@@ -34,11 +33,11 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
 
     device: see get_device
 
-    Raises ValueError where `model_frame` does.
+    Raises ValueError where `Blend.resolve_frame` does.
     """
     check_instance("blend", blend, Blend)
     device = get_device(device)
-    frame = blend.frame or model_frame(blend.observations)
+    frame = blend.resolve_frame()
     positions = frame.positions_of(blend.sources, blend.observations, blend.initial_shifts())
     inside = frame.contains(positions)
     views = [_in_frame(o, frame, device) for o in blend.observations]

@@ -28,10 +28,10 @@ class Source:
     observation: the name (or label, if it has no name) of the Observation whose pixels position_px
         refers to; None = those of the model frame. By default the model frame is the union of all
         footprints (see `model_frame`), whose first pixel few users know: pass the frame too, or
-        the observation's name
+        the observation's name. Sources of a Result are in pixels of its frame: pass that with them
     name: its name in the catalogue, unique in a fit; None = its number
-    group: number of the sources that may be pieces of one galaxy with it, as `detect` gives it; the
-        catalogue then has their total fluxes too. None = it is no piece
+    group: number of the sources that may be pieces of one galaxy with it, as `detect` gives it, of
+        one detection; the catalogue then has their total fluxes too. None = it is no piece
     sky_frame: "icrs" where sky_deg was a SkyCoord; None = numbers in the frame of the grid's WCS
 
     Raises ValueError unless there is exactly one position, which must be finite, and for an
@@ -182,7 +182,7 @@ def group_rows(sources) -> list[int]:
     return [i if s.group is None else first.setdefault(s.group, i) for i, s in enumerate(sources)]
 
 
-def grouped_with(sources, more, hosts) -> tuple:
+def join_groups(sources, more, hosts) -> tuple:
     """Sources and more of them, in the groups of their hosts.
 
     hosts (k,): number of the source of which each one of `more` may be a piece, -1 for none

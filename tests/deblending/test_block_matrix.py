@@ -158,5 +158,5 @@ def test_neighbours_are_those_whose_rows_meet(monkeypatch):
     )
     layout = SimpleNamespace(shift=lambda _: None, n_sky=0, spectra_at=lambda c: c)
     images, spectra = [np.zeros((1, 2, 2))] * 4, np.ones((4, 1))
-    Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, [None] * 4, spectra)
+    Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, [()] * 4, spectra)
     assert sorted(pairs) == [(0, 0), (0, 1), (1, 1), (2, 2)]

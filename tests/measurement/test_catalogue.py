@@ -21,7 +21,7 @@ from clresample.measurement.photometry import redistribute
 from clresample.measurement.quality import summary
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
-from clresample.sky.sources import ExtendedSource, PointSource, group_rows, grouped_with
+from clresample.sky.sources import ExtendedSource, PointSource, group_rows, join_groups
 
 
 def test_names_and_frame_are_those_of_the_wcs():
@@ -180,7 +180,7 @@ def test_sources_of_one_group_have_its_flux_and_a_flag():
 def test_late_sources_are_in_the_groups_of_their_hosts():
     sources = [ExtendedSource(position_px=(1, i), group=g) for i, g in enumerate((None, 3, None))]
     more = [ExtendedSource(position_px=(2, i)) for i in range(4)]
-    found = grouped_with(sources, more, [2, 1, -1, 2])
+    found = join_groups(sources, more, [2, 1, -1, 2])
     assert [s.group for s in found] == [None, 3, 4, 4, 3, None, 4]
     assert group_rows(found) == [0, 1, 2, 2, 1, 5, 2]
     with pytest.raises(ValueError, match="group is -1, must be 0 or more"):

@@ -100,14 +100,18 @@ def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away
 @pytest.mark.parametrize("away_arcsec, more", ((0.5, 0.1 / (0.025 * np.pi * 0.25)), (1.5, 1.0)))
 def test_what_has_a_part_of_all_light_is_a_source_where_clumps_are_rarer(away_arcsec, more):
     """On light that would hide it otherwise, at any distance for which there is a chance of it."""
-    galaxy, part = spot((60, 60), 1000, sigma=4), 0.03 * more
-    light = 60 * 2.27 * FWHM**2  # of a point of height 60
-    for height, is_one in ((0.95 * part * 60, False), (1.05 * part * 60, True)):
-        image = galaxy + spot((60, 76), height)
-        both = np.stack([image, image])
-        given = {"scale": away_arcsec / 16, "light": light}
-        assert judge(image, both, (60, 76), **given) == is_one
-        assert not judge(image, both, (60, 76), scale=away_arcsec / 16)
+    galaxy, part = spot((60, 60), 1000, sigma=8), 0.03 * more
+    for points in (
+        0.0,
+        1500.0,
+    ):  # all of the galaxy's light as heights of points, its peak at least
+        limit = part * max(points, 1000.0)
+        for height, is_one in ((0.95 * limit, False), (1.05 * limit, True)):
+            image = galaxy + spot((60, 68), height)
+            both = np.stack([image, image])
+            given = {"scale": away_arcsec / 8, "light": points * 2.27 * FWHM**2}
+            assert judge(image, both, (60, 68), **given) == is_one
+            assert not judge(image, both, (60, 68), scale=away_arcsec / 8)
 
 
 def test_centres_are_found_to_part_of_a_pixel():

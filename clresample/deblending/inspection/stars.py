@@ -32,7 +32,7 @@ POINT_SIGMAS = 100.0
 # [its error], [Settings.psf_error] Largest excess of its width, whichever is more: it is more often
 # a compact galaxy's than the PSF's error. With 5 and 1 in sum 23 of 64 galaxies of r_e .08 to .16"
 # under a PSF of .7", signal to noise 60 to 800, were flagged as misfits.
-WIDER_SIGMAS, WIDER_PART = 2.0, 0.5
+MAX_WIDE_SIGMAS, MAX_WIDE_PART = 2.0, 0.5
 # [its error] Largest level about such a star: more is of a host or a neighbour. [scatter of chi2]
 # What noise may leave.
 MAX_LEVEL_SIGMAS, NOISE_SIGMAS = 5.0, 3.0
@@ -68,7 +68,8 @@ def point_sources(images, listed, psf_error):
     """Selects those of the sources `listed` (S,) bool that look like the PSF: stars.
 
     By the sharpest of InspectedImages that shows POINT_SIGMAS of their light, or less and that they
-    are wider. psf_error [1]: of the PSF's width, see Settings
+    are wider. psf_error [1]: of the PSF's width, see Settings; light may be narrower by as much,
+    and wider by MAX_WIDE_PART of it
     """
     found, left = np.zeros_like(listed), listed.copy()
     for image in sorted(images, key=lambda one: one.width_arcsec):
@@ -79,7 +80,7 @@ def point_sources(images, listed, psf_error):
                 continue
             unlike = max(-w.part - WIDTH_SIGMAS * w.error, w.rest)
             found[i] = unlike <= psf_error and abs(w.level) <= MAX_LEVEL_SIGMAS
-            found[i] &= w.part <= max(WIDER_SIGMAS * w.error, WIDER_PART * psf_error)
+            found[i] &= w.part <= max(MAX_WIDE_SIGMAS * w.error, MAX_WIDE_PART * psf_error)
             found[i] &= _host_light(image, i, w, psf_error) < HOST_SIGMAS
             left[i] = False
     return found

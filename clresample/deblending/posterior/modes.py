@@ -150,14 +150,14 @@ class Solution:
         )
         scatter = scatter / self.peaks[i]
         far *= np.append(1 / self.peaks[i], scatter)
-        groups, smooth = [], []
+        parts, smooth = [], []
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
             least = min(MIN_LIGHT, FAINTEST / max(self._peaks[i], 1e-30))
             given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
-            groups = self._smooth_modes(i, SmoothModes(*given, least_light=least))
-            smooth = [CellImages(*group) for group in groups if group[1] > 1]
-        sharp = [group for group, pixel in groups if pixel == 1]
+            parts = self._smooth_modes(i, SmoothModes(*given, least_light=least))
+            smooth = [CellImages(*part) for part in parts if part[1] > 1]
+        sharp = [own for own, pixel in parts if pixel == 1]
         sharp.append(flush_faint(scatter[:, None, None] * images).astype(np.float32))
         seen = np.concatenate([flush_faint(self.morphs[i].copy())[None], *sharp], dtype=np.float32)
         modes = ModeImages(tuple(smooth), seen[1:]) if smooth else seen[1:]
@@ -169,9 +169,9 @@ class Solution:
 
         Those of wider ones come first, on their own pixels.
         """
-        groups = bumps.groups()
-        images = [bumps.images(pixel, last) for _, last, pixel in groups]
-        pairs = list(zip(groups, images, strict=True))
+        widths = bumps.widths()
+        images = [bumps.images(pixel, last) for _, last, pixel in widths]
+        pairs = list(zip(widths, images, strict=True))
         change = [self.flux_change_sigma(i, own[first:], pixel) for (first, _, pixel), own in pairs]
         keep = np.flatnonzero(np.concatenate(change) > MIN_CHANGE)
         weights = whitening_transform(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
@@ -278,9 +278,12 @@ def gauged(sums, along):
 
 def _combined(images, keep, weights):
     """Combinations (m, ny, nx) of the images `keep` (k,); weights (m, k), 0 above the diagonal."""
-    out, weights = images[keep], weights.astype(np.float32)
+    weights = weights.astype(np.float32)
     if len(weights) < len(keep):
-        return np.tensordot(weights, out, 1)
+        of_all = np.zeros((len(weights), len(images)), np.float32)
+        of_all[:, keep] = weights
+        return np.tensordot(of_all, images, 1)
+    out = images[keep]
     if len(keep):
         # the transpose, since BLAS counts rows first; in place
         strmm(1.0, weights.T, out.reshape(len(out), -1).T, side=1, overwrite_b=1)

@@ -112,8 +112,8 @@ class SmoothModes:
         found *= amplitude
         return found
 
-    def groups(self):
-        """Modes that share pixels: (first, last, pixel) of those from first to last - 1."""
+    def widths(self):
+        """Modes of one width: (first, last, pixel) of those from first to last - 1."""
         n, (wide, narrow) = self.n_coarse, self.pixels
         if n in (0, len(self)) or wide == narrow:
             return [(0, len(self), wide if n else narrow)]

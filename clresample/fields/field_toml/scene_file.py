@@ -25,7 +25,7 @@ from ...paper.solver.constraints import Positivity, ProxChain
 from ...paper.solver.prior import SingleScalePrior
 from ...sky.box import Box
 from ...sky.extent import grid_intersection, grid_union
-from ...sky.frame import Frame, model_frame
+from ...sky.frame import Frame, grow_to_sources, model_frame
 from ...sky.noise import NoiseWarning
 from ...sky.observation import Observation, check_observations
 from ...sky.psf_checks import PSFWarning
@@ -93,6 +93,8 @@ def read_scene(path) -> SceneFile:
             sources = read_sources(inputs["sources"], tables["sources"])
         except ValueError as error:
             raise SceneError(f"{path}: sources: {error}") from error
+        if tables["frame"].get("footprint") != "intersection":
+            frame = grow_to_sources(frame, observations, sources)
     detection = tables.get("detection", {})
     return SceneFile(
         tuple(observations),
