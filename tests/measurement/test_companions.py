@@ -108,10 +108,10 @@ def test_what_has_a_part_of_all_light_is_a_source_where_clumps_are_rarer(away_ar
         limit = part * max(points, 1000.0)
         for height, is_one in ((0.95 * limit, False), (1.05 * limit, True)):
             image = galaxy + spot((60, 68), height)
-            both = np.stack([image, image])
+            one = image[None]  # of no colour
             given = {"scale": away_arcsec / 8, "light": points * 2.27 * FWHM**2}
-            assert judge(image, both, (60, 68), **given) == is_one
-            assert not judge(image, both, (60, 68), scale=away_arcsec / 8)
+            assert judge(image, one, (60, 68), **given) == is_one
+            assert not judge(image, one, (60, 68), scale=away_arcsec / 8)
 
 
 def test_centres_are_found_to_part_of_a_pixel():
