@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -63,17 +64,17 @@ class Frame:
         observations: Observations that sources may refer to; shifts (n_observations, 2) [model px]:
             of these; see `Source.pixel`
         """
-        found, on_sky = np.full((len(sources), 2), np.nan), {}
+        found, of_frame = np.full((len(sources), 2), np.nan), defaultdict(list)
         for i, source in enumerate(sources):
             if source.sky_deg is None:
                 found[i] = source.pixel(self.grid, observations, shifts)
             else:
-                on_sky.setdefault(source.sky_frame, []).append(i)
-        for sky_frame, rows in on_sky.items():  # a SkyCoord takes milliseconds
-            place = np.array([sources[i].sky_deg for i in rows], float).T
+                of_frame[source.sky_frame].append(i)
+        for sky_frame, rows in of_frame.items():  # together, as a SkyCoord takes milliseconds
+            a, b = np.array([sources[i].sky_deg for i in rows], float).T
             if sky_frame is not None:
-                place = [SkyCoord(*place, unit="deg", frame=sky_frame)]
-            found[rows] = self.grid.pixel(*place)
+                a, b = SkyCoord(a, b, unit="deg", frame=sky_frame), None
+            found[rows] = self.grid.pixel(a, b)
         return found
 
     def contains(self, positions) -> np.ndarray:

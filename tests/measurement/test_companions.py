@@ -99,12 +99,9 @@ def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away
 
 @pytest.mark.parametrize("away_arcsec, more", ((0.5, 0.1 / (0.025 * np.pi * 0.25)), (1.5, 1.0)))
 def test_what_has_a_part_of_all_light_is_a_source_where_clumps_are_rarer(away_arcsec, more):
-    """On light that would hide it otherwise, at any distance for which there is a chance of it."""
+    """On light that would hide it otherwise; all of the galaxy's is at least that of its peak."""
     galaxy, part = spot((60, 60), 1000, sigma=8), 0.03 * more
-    for points in (
-        0.0,
-        1500.0,
-    ):  # all of the galaxy's light as heights of points, its peak at least
+    for points in (0.0, 1200.0):
         limit = part * max(points, 1000.0)
         for height, is_one in ((0.95 * limit, False), (1.05 * limit, True)):
             image = galaxy + spot((60, 68), height)
