@@ -20,18 +20,22 @@ from clresample.files.draws import draw_hdus, read_draws
 LARGE = (((32.4, 30.7), (2000, 1500, 2500), 9.0), ((40.0, 52.0), (90, 60, 90), 2.0))
 
 
-def drawn(shape=(7, 10), pixel=4, k=(3, 2)):
+def drawn(shape=(7, 10), pixels=(4, 2), k=(3, 1, 2)):
+    """Modes of two widths on pixels of their own, and sharp ones."""
     rng = np.random.default_rng(0)
-    cells = k[0], *(-(-n // pixel) for n in shape)
-    return ModeImages((CellImages(rng.normal(size=cells), pixel),), rng.normal(size=(k[1], *shape)))
+    smooth = [
+        CellImages(rng.normal(size=(n, *(-(-side // pixel) for side in shape))), pixel)
+        for n, pixel in zip(k, pixels, strict=False)
+    ]
+    return ModeImages(tuple(smooth), rng.normal(size=(k[-1], *shape)))
 
 
 def test_images_in_cells_are_arrays():
     """They keep the means, and polynomials of second order."""
     modes, rng = drawn(), np.random.default_rng(1)
     dense = np.asarray(modes)
-    assert dense.shape == modes.shape == (5, 7, 10) and len(modes) == 5
-    values = rng.normal(size=(4, 5))
+    assert dense.shape == modes.shape == (6, 7, 10) and len(modes) == 6
+    values = rng.normal(size=(4, 6))
     np.testing.assert_allclose(combined(modes, values), np.tensordot(values, dense, 1))
     np.testing.assert_allclose(combined(modes, values[0]), np.tensordot(values[0], dense, 1))
     weights = rng.normal(size=(2, 7, 10))
@@ -43,13 +47,13 @@ def test_images_in_cells_are_arrays():
     found = cells.on_pixels(cells.values, image.shape)[0]
     np.testing.assert_allclose(cell_sums(found, 4), cell_sums(image, 4))
     np.testing.assert_allclose(found, image, atol=1e-9)
-    image, parts = rng.normal(size=(7, 10)), rng.normal(size=5)
+    image, parts = rng.normal(size=(7, 10)), rng.normal(size=6)
     before = sums_with(modes, np.ones((1, 7, 10)))[0]
     subtract(modes, parts, image)
     after = sums_with(modes, np.ones((1, 7, 10)))[0]
     padded = cell_sums(image, 4).sum(), image.sum()
     assert padded[0] == pytest.approx(padded[1])
-    np.testing.assert_allclose(before[3:] - after[3:], parts[3:] * image.sum())
+    np.testing.assert_allclose(before[4:] - after[4:], parts[4:] * image.sum())
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from helpers.blends import (
 )
 from helpers.headers import grid_of, header
 
+from clresample.files.results import read_result, write_result
 from clresample.measurement.catalogue import FLAG_MEANINGS, Flag, catalogue
 from clresample.measurement.photometry import redistribute
 from clresample.measurement.quality import summary
@@ -161,20 +162,24 @@ def test_no_coverage_is_a_centre_off_an_image():
     assert flags(one_source(observations=[full, left], shifts=moved)) == [Flag(0)]
 
 
-def test_sources_of_one_group_have_its_flux_and_a_flag():
+def test_sources_of_one_group_have_its_flux_and_a_flag(tmp_path):
     """By default of their own groups; sources without any have rows of their own."""
     places = ((30, 20), (30, 28), (30, 44))
     components = [round_component(i, place, (1.0 + i, 2.0)) for i, place in enumerate(places)]
     result = blend(components)
     assert "group_id" not in catalogue(result).colnames
     own = [replace(s, group=g) for s, g in zip(result.sources, (None, 7, 7), strict=True)]
-    table = catalogue(replace(result, sources=tuple(own)))
+    grouped = replace(result, sources=tuple(own))
+    table = catalogue(grouped)
+    write_result(tmp_path / "grouped.fits", grouped)
+    assert read_result(tmp_path / "grouped.fits").sources == grouped.sources
     assert list(table["group_id"]) == [0, 1, 1] and list(table["n_group"]) == [1, 2, 2]
     assert [Flag(f) & Flag.GROUP for f in table["flags"]] == [Flag(0), Flag.GROUP, Flag.GROUP]
     flux, total = table["flux_g"].value, table["group_flux_g"].value
     np.testing.assert_allclose(total, [flux[0], flux[1] + flux[2], flux[1] + flux[2]])
     given = catalogue(result, groups=[5, 1, 1])
     np.testing.assert_array_equal(given["group_flux_g"], table["group_flux_g"])
+    assert not any(Flag(f) & Flag.GROUP for f in given["flags"])  # may be any the caller likes
 
 
 def test_late_sources_are_in_the_groups_of_their_hosts():
