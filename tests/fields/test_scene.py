@@ -321,6 +321,18 @@ def test_pixels_may_be_those_of_an_observation(folder, tmp_path):
     assert [s.observation for s in on_sky] == [None, None]
 
 
+def test_the_frame_has_room_for_a_listed_source_just_outside(folder):
+    """But where it is asked to be that of the images alone."""
+    ra, dec = Grid.from_wcs(GRID, (30, 34)).sky(np.array([10.0, 33.0]), np.array([12.0, 20.0]))
+    Table({"ra": ra, "dec": dec}).write(folder / "beside.csv")
+    text = ONE + SOURCES.replace("sources.csv", "beside.csv")
+    found = scene(folder, text)
+    assert found.frame.shape[0] > 34 and found.frame.shape[1] == 34
+    assert found.frame.contains(found.frame.positions_of(found.sources)).all()
+    cut = scene(folder, text + '[frame]\nfootprint = "intersection"')
+    assert cut.frame.shape == (30, 34)
+
+
 def test_a_list_with_a_name_twice_is_refused(tmp_path):
     Table({"y": [4.0, 5.0], "x": [5.0, 6.0], "name": ["a", "a"]}).write(tmp_path / "list.ecsv")
     with pytest.raises(ValueError, match=r"list.ecsv: name 'a' is that of 2 sources, must be"):
