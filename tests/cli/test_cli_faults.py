@@ -119,8 +119,8 @@ def test_names_of_channels(scene, capsys, name):
     text = (scene / "scene.toml").read_text().replace("\\x", "\\u00")
     (scene / "scene.toml").write_text(text)
     status = deblend(scene)
-    if len(name) > 59:
-        assert status == 2 and "has 60 characters, columns of the catalogue take 59" in refused(
+    if len(name) > 53:
+        assert status == 2 and "has 60 characters, columns of the catalogue take 53" in refused(
             capsys
         )
         assert not (scene / "out").exists()
