@@ -137,16 +137,14 @@ def peak_beside(image, star) -> float:
     return float(image[away < 2 * star.radius + 1].max(initial=0.0))
 
 
-def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.ndarray]:
+def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> SignalToNoise:
     """Removes the light of StarPlaces from a signal, in units of its scatter there.
 
-    Also returns the pixels (Ny, Nx) bool from which light was removed. Their sums of squares are
-    left out, because such light adds to every channel.
+    Sums of squares are left out there, because such light adds to every channel.
     fwhm_px [px]: of the PSF; pixel_arcsec [arcsec]: side of a pixel
     """
-    all_held = np.zeros(signal.n_seen.shape, bool)
     if not stars:
-        return signal, all_held
+        return signal
     sums, squares, seen = signal.sums.copy(), signal.squares.copy(), signal.measured
     root = np.sqrt(np.maximum(signal.n_seen, 1))
     for w, sigma in enumerate(WIDTHS_ARCSEC):
@@ -156,8 +154,7 @@ def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoi
         rest, held = _without_stars(signal.flat(w), seen, stars, point_px)
         sums[w] = np.where(held, rest * root, sums[w])
         squares[w][held] = 0
-        all_held |= held
-    return replace(signal, sums=sums, squares=squares), all_held
+    return replace(signal, sums=sums, squares=squares)
 
 
 def _without_stars(image, seen, stars, fwhm):
