@@ -37,7 +37,7 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
     """
     check_instance("blend", blend, Blend)
     device = get_device(device)
-    frame = blend.resolve_frame()
+    frame = blend.frame or blend.resolve_frame()
     positions = frame.positions_of(blend.sources, blend.observations, blend.initial_shifts())
     inside = frame.contains(positions)
     views = [_in_frame(o, frame, device) for o in blend.observations]
