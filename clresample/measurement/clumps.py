@@ -56,11 +56,13 @@ CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
 ROUGH, SMOOTHEST = 0.2, 0.05
 # [1] contrast of stars before a galaxy; most knots of simulated disks have less, some up to 86
 STAR = 30.0
-# [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py). Number
-# of them on a small galaxy from which on its peaks are in no group: neighbours are then more
-# frequent than knots. Of 22 such peaks in 50 images of Rubin or HSC 19 were other sources, at 1.4
-# to 4"; of 28 in Euclid's, whose small galaxies have a tenth of the area, 2 were.
-CHANCE, MAX_BY_CHANCE = 0.025, 0.1
+# [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
+CHANCE = 0.025
+# [1] Number of sources by chance on a small galaxy below which its peaks may be in its group: with
+# more, neighbours are more frequent than knots. Of 22 peaks in groups in 50 images of Rubin or HSC
+# 19 were other sources, at 1.4 to 4"; of 28 in Euclid's, whose small galaxies have a tenth of the
+# area, 2 were.
+MAX_BY_CHANCE = 0.1
 # [1] of a body's level: a peak behind a lower saddle does not belong to the body.
 FRINGE = 0.03
 # [1] Two bodies are merged if the fainter one's level exceeds the saddle between them by less than
@@ -89,7 +91,7 @@ class Body:
     center (2,) [px]: (y, x); level [sigma]: of its highest isophote of the least area
     light [sigma]: all of its light as the peak of a point source; outline: (slices, mask) of it
     clump [1]: contrast up to which peaks are its structure, 0 of a faint one
-    member [1]: part up to which peaks are in its group
+    member_part [1]: part up to which peaks are in its group
     group: number of the body in whose group it is, of those of one outline: its own, or that of the
         brightest nucleus if its own one rises from their light by less than a clump may
     """
@@ -99,7 +101,7 @@ class Body:
     light: float
     outline: tuple
     clump: float
-    member: float
+    member_part: float
     group: int
 
     @property
@@ -135,7 +137,7 @@ class Body:
         """
         part = above / self.light
         faint = part < CLUMP_PART
-        is_member = (part < self.member) & (faint | (above < STAR * base))
+        is_member = (part < self.member_part) & (faint | (above < STAR * base))
         return (above < self.clump * base) & faint, is_member
 
 
@@ -228,8 +230,8 @@ def bodies_of(image, places, fwhm_px, threshold, scale, *, least=BODY_AREA) -> B
         centers = [center, *nuclei] if is_peak or not nuclei else nuclei
         chance, n_found = CHANCE * scale**2, len(found)
         own = at[members], base[members]
-        few = least == BODY_AREA or chance * outline[1].sum() < MAX_BY_CHANCE
-        given = level, point, chance, bright, MEMBER_PART if few else 0.0
+        crowded = least < BODY_AREA and chance * outline[1].sum() >= MAX_BY_CHANCE
+        given = level, point, chance, bright, 0.0 if crowded else MEMBER_PART
         found += _divided(image, outline, centers, *given, own, n_found)
         of_tree += [(members, range(n_found, len(found)))]
     owners, structure = np.full(n, -1), np.zeros(n, bool)
@@ -279,11 +281,11 @@ def _nuclei(image, basins, where, at, base, point):
     return found
 
 
-def _divided(image, outline, centers, level, point, chance, bright, member, peaks, first):
+def _divided(image, outline, centers, level, point, chance, bright, member_part, peaks, first):
     """The Bodies of an outline, one of each centre (2,) [px]: its pixels nearest to that.
 
     level [sigma]: of all; point [px]: area of a point source's image; chance [px^-2]: of sources
-    by chance; bright: whether peaks on them can be structure; member: see Body; peaks: places
+    by chance; bright: whether peaks on them can be structure; member_part: see Body; peaks: places
     (k, 2) [px] and bases (k,) [sigma] of all; first: number of the first Body
     """
     where, mask = outline
@@ -303,7 +305,7 @@ def _divided(image, outline, centers, level, point, chance, bright, member, peak
             rough = max(SMOOTHEST, _roughness(image[where], own, center - corner, level)) / ROUGH
             clump = CLUMP * min(1.0, rough**2, 1 / (chance * mask.sum()))
         light = float(image[where][own].sum()) / point
-        found.append(Body(center, level, light, (where, own), clump, member, first + group))
+        found.append(Body(center, level, light, (where, own), clump, member_part, first + group))
     return found
 
 

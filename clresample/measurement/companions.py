@@ -61,9 +61,9 @@ UNSEEN = 1e30  # [sigma] value of unobserved pixels: the minimum is then that of
 
 
 def symmetric_residual(image, seen, positions):
-    """Residual of an image after symmetric models of sources, the sum of these, both (Ny, Nx).
+    """Residual of an image after symmetric models of sources, their sum, and the light of each.
 
-    Also returned is all light (S,) of each.
+    The first two are images (Ny, Nx) [sigma], the light (S,) sums of them.
 
     image (Ny, Nx) [sigma]; seen (Ny, Nx) bool; positions (S, 2) [px]: centres, to part of a pixel
     """

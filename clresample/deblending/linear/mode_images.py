@@ -57,12 +57,7 @@ class ModeImages:
     @property
     def shape(self):
         """(k, ny, nx)."""
-        return sum(map(len, self.parts)), *self.sharp.shape[1:]
-
-    @property
-    def parts(self):
-        """All of them, in their order."""
-        return *self.smooth, self.sharp
+        return sum(map(len, (*self.smooth, self.sharp))), *self.sharp.shape[1:]
 
     def __array__(self, dtype=None, copy=None):
         smooth = [part.on_pixels(part.values, self.shape[1:]) for part in self.smooth]
