@@ -22,8 +22,8 @@ ratio, pull flux over truth, (flux - truth) / error; of the band where the pull 
 chi2        per pixel with weight, all images together
 flags       of the source, in the catalogue
 silent      over 5 % and 5 sigma off in a band, and the source has none of the flags MISFIT,
-            NOT_CONVERGED, SATURATED, AMBIGUOUS, NO_COVERAGE, OUTSIDE_FRAME. EDGE is no excuse: the
-            truth's range allows for light beyond the image
+            NOT_CONVERGED, SATURATED, AMBIGUOUS, NO_COVERAGE, OUTSIDE_FRAME, UNLISTED. EDGE is no
+            excuse: the truth's range allows for light beyond the image
 seconds     processor time of the fit, on one thread
 
 The JSON has the ratios and pulls of all bands. `ladder_cases.scene_of` draws a row's scene again.
@@ -61,7 +61,9 @@ RIGHT, RIGHT_SIGMA = 0.03, 3.0
 WRONG, WRONG_SIGMA = 0.05, 5.0
 LOST, LOST_SIGMA = 2.0, 4.0  # factor and sigma by which a source is taken by another
 CHI2 = 1.1
-SAYS_SO = {"MISFIT", "NOT_CONVERGED", "SATURATED", "AMBIGUOUS", "NO_COVERAGE", "OUTSIDE_FRAME"}
+SAYS_SO = {
+    "MISFIT", "NOT_CONVERGED", "SATURATED", "AMBIGUOUS", "NO_COVERAGE", "OUTSIDE_FRAME", "UNLISTED"
+}  # fmt: skip
 COVERAGE_RE_PX = (4.0, 32.0)
 COVERAGE_SNR = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of a band's flux
 COLUMNS = records.columns(

@@ -35,6 +35,8 @@ class Fit:
 
     blend, settings, frame: as `inspect` returns them
     problems (n,): messages of that inspection; sky_levels: SkyLevel of each observation
+    given (S,): bool, sources that are as they were listed
+    unlisted: peaks without a source, see Result
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; undetected (n_dark,): of those far from any
         light
@@ -56,14 +58,17 @@ class Fit:
         shifts = blend.initial_shifts()
         positions = self.frame.positions_of(blend.sources, blend.observations, shifts)
         found = inspect(blend, self.frame, positions, shifts, settings)
-        blend, settings, shifts = found.blend, found.settings, found.shifts
+        given, blend, settings, shifts = blend, found.blend, found.settings, found.shifts
         positions = self.frame.positions_of(blend.sources, blend.observations, shifts)
         inside, outside = _inside(self.frame, positions, blend.sources)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
         self.blend, self.settings = blend, settings
         self.problems, self.sky_levels = found.messages, found.levels
+        self.unlisted = found.unlisted
         self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
+        pairs = zip(blend.sources, given.sources, strict=True)
+        self.given = np.array([one is other for one, other in pairs], bool)
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
         self.geometry = SceneGeometry(
             self.frame, padded, positions[self.fitted], settings.psf_tolerance
@@ -98,7 +103,10 @@ class Fit:
         thetas = self.blend.thetas if len(self.blend.thetas) else [None] * len(self.sources)
         sources, thetas = ([some[k] for k in i] for some in (self.sources, thetas))
         positions, observations = self._positions[i], self.blend.observations
-        return StartInput(self.frame, sources, positions, self.views, tuple(thetas), observations)
+        given = tuple(np.flatnonzero(self.given[i]).tolist())
+        return StartInput(
+            self.frame, sources, positions, self.views, tuple(thetas), observations, given
+        )
 
     @property
     def signature(self):
@@ -117,6 +125,7 @@ class Fit:
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
+        self.messages += [_wide_message(self.fitted[i], g) for i, g in point.not_points.items()]
         self._first_shifts, self._going_on = self.shifts, None
         self.restart()
         self.seconds["setup"] += seconds + time.perf_counter() - began
@@ -200,6 +209,7 @@ class Fit:
             thetas=_by_source(self, self.start.thetas),
             structures=_structures(self),
             psf_error=self.settings.psf_error,
+            unlisted=self.unlisted,
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
@@ -343,6 +353,15 @@ def _padded_frame(frame, pad):
     """The frame with its sides grown to multiples of `pad`, from the same first pixel on."""
     shape = tuple(round_up(n, pad) for n in frame.shape)
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
+
+
+def _wide_message(i_source, gain):
+    """Message about a point source that is better as a galaxy, by a gain in chi2."""
+    return (
+        "a point source is wider than the PSF, or lies elsewhere: with a galaxy in the place of "
+        f"source {i_source}, chi2 is lower by {gain:.0f}; the errors of fluxes hold the "
+        "difference; list it as an ExtendedSource, or give free_position=True"
+    )
 
 
 def _dark_message(i_source, position):

@@ -74,6 +74,7 @@ class Result(ResultDisplay):
     status: an Ended, which compares as its text: "converged", "misfit" (its steps ended, but the
         model does not describe the data, see `Misfit.is_wrong`), "iteration limit", "diverged" or
         "interrupted"
+    unlisted: peaks of light that no source is listed for, (observation, y [px], x [px]) each
     thetas (S): of each source a tuple of its components' parameters (n,), of the smooth profiles
         from which the fit began; another fit of these sources may start from them, see Blend. ():
         of a result that was read
@@ -98,6 +99,7 @@ class Result(ResultDisplay):
     thetas: tuple = ()
     structures: tuple = ()
     psf_error: float = 0.0
+    unlisted: tuple = ()
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 

@@ -183,6 +183,7 @@ def read_result(path) -> Result:
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
             psf_error=about.get("psf_error", 0.0),
+            unlisted=tuple(map(tuple, about.get("unlisted", ()))),
             errors=_errors(hdus),
             draws=read_draws(hdus, [(row["n_y"], row["n_x"]) for row in hdus["COMPONENTS"].data]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
@@ -196,6 +197,7 @@ def _about(result):
         "messages": result.messages,
         "seconds": result.seconds,
         "psf_error": result.psf_error,
+        "unlisted": result.unlisted,
         "sources": [
             # without ExtendedSource.profile, which only starts a fit
             {"kind": type(s).__name__}

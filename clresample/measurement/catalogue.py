@@ -12,6 +12,7 @@ from astropy.table import QTable
 from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
 from ..deblending.assessment.status import misfitted_sources
+from ..deblending.assessment.unlisted import beside_unlisted_light
 from ..deblending.assessment.unsettled import unsettled_sources
 from ..deblending.inspection.listing import doubles
 from ..deblending.posterior.residuals import channel_residuals
@@ -52,6 +53,7 @@ class Flag(IntFlag):
     SATURATED = 128
     AMBIGUOUS = 256
     GROUP = 512
+    UNLISTED = 1024
 
     @classmethod
     def _missing_(cls, value):
@@ -72,6 +74,7 @@ FLAG_MEANINGS = {
     Flag.MISFIT: "the model leaves over 5 sigma (4 beside a point) and over 3 % of the flux",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
     Flag.GROUP: "one of several sources that may be pieces of one galaxy: group_flux_* is of all",
+    Flag.UNLISTED: "its model, or one that overlaps it, holds the light of a peak without a source",
 }
 
 
@@ -333,6 +336,7 @@ def _flags(result, flux, error, positions, footprints):
         flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.CENTER_MASKED
     flags[masked_cores(result, positions)] |= Flag.SATURATED
     flags[reaches_outside(result, flux)] |= Flag.EDGE
+    flags[beside_unlisted_light(result)] |= Flag.UNLISTED
     edge = coverage_border(result.unobserved)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import bdtrc
 
 from ..deblending.assessment.status import misfitted_sources
+from ..deblending.assessment.unlisted import beside_unlisted_light
 from ..deblending.posterior.residuals import pixels_in_boxes
 from ..deblending.posterior.sampling import undetermined
 from ..deblending.result import Result
@@ -32,14 +33,14 @@ def summary(result) -> dict:
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
         shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources that
         are flagged MISFIT (`misfitted_sources`); good, True if the fit converged at a model that
-        describes the data and no source is a misfit
+        describes the data, and no source is a misfit or UNLISTED
     """
     check_instance("result", result, Result)
     chi2, n_pixels = channel_chi2(result)
     misfits = np.flatnonzero(misfitted_sources(result)).tolist()
     return {
         "status": str(result.status),
-        "good": result.converged and not misfits,
+        "good": result.converged and not misfits and not beside_unlisted_light(result).any(),
         "misfits": misfits,
         "messages": list(result.messages),
         "n_sources": len(result.sources),

@@ -46,7 +46,7 @@ def ended(noise=(None, "correlated")):
         state=SimpleNamespace(morph=morphs, learned=learned),
         shifts=np.array([(0, 0), (0.1, 0.2)]), losses=[3.0, 2.0], status="converged",
         messages=["one"], seconds={"result": 1.0, "fit": 2.0},
-        settings=SimpleNamespace(fit_sky="whether", psf_error=0.02),
+        settings=SimpleNamespace(fit_sky="whether", psf_error=0.02), unlisted=((0, 1, 2),),
     )  # fmt: skip
     fit.note_seconds = lambda what, s: fit.seconds.update({what: fit.seconds[what] + s})
     return fit

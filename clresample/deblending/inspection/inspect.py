@@ -69,6 +69,7 @@ class Inspection:
     shifts (n_observations, 2) [model px]: of the observations, from which a fit of them starts
     messages: a sentence for each problem
     levels: SkyLevel of each observation, that of a fit if the sky is fitted
+    unlisted: peaks that no source is listed for, see Result
     """
 
     blend: Blend
@@ -76,6 +77,7 @@ class Inspection:
     shifts: np.ndarray
     messages: list[str]
     levels: list[SkyLevel]
+    unlisted: tuple
 
 
 def inspect(blend, frame, positions, shifts, settings) -> Inspection:
@@ -85,7 +87,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     """
     near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]
-    messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
+    messages, levels, found, unlisted = _doubles(blend.sources, positions), [], [], []
+    images: list[InspectedImage] = []
     auto, small = settings.fit_sky == AUTO, settings.fit_sky == SMALL
     free = not (auto or small) and bool(settings.fit_sky)
     fit_sky = False
@@ -121,7 +124,9 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
             lines += about + noise_lines(image, sky)
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
-        lines += _missing(image) + _widths(image, sources, near)
+        peaks = listing.unlisted(image)
+        unlisted += [(len(images), y, x) for _, y, x in peaks]
+        lines += _missing(peaks) + _widths(image, sources, near)
         messages += [f"{observation.label}: {line}" for line in lines]
         images.append(image)
     messages += _offset(images, found)
@@ -142,7 +147,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move, fit_sky=fit_sky)
     of_fit = [pair[fit_sky] for pair in levels]
-    return Inspection(blend, settings, shifts, messages + lines, of_fit)
+    return Inspection(blend, settings, shifts, messages + lines, of_fit, tuple(unlisted))
 
 
 def _doubles(sources, positions):
@@ -331,8 +336,7 @@ def _coarse(psf, channels):
     ]
 
 
-def _missing(image):
-    peaks = listing.unlisted(image)
+def _missing(peaks):
     if not peaks:
         return []
     some = ", ".join(f"({y}, {x}) at {value:.0f} sigma" for value, y, x in peaks[:3])

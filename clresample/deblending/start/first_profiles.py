@@ -141,10 +141,12 @@ def _next(looking, models, rest, error):
     return dict(apart(around, listed, gain, at))
 
 
-def products_beside(looking, models, listed, error):
+def products_beside(looking, models, listed, error, components=None):
     """LinearisedScenes of components [(i, theta)], and three products (n, C) of their images.
 
     With the data minus the models {component: theta}, with the data, and with themselves.
+
+    components (n): StartComponents in place of those listed
     """
     sky, modelled = looking.sky.copy(), np.zeros(0, int)
     if models:
@@ -153,7 +155,7 @@ def products_beside(looking, models, listed, error):
         before.compute_residuals(error)
         modelled = before.scenes
         sky[modelled] = before.sky[modelled]
-    around = _instead(looking, listed)
+    around = _instead(looking, listed, components)
     right = np.zeros((len(listed), looking.n_channels))
     for sight in around.sights:
         right[around.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0]
@@ -180,9 +182,10 @@ def apart(around, listed, gain, at):
     return [listed[k] for k in taken]
 
 
-def _instead(looking, listed):
+def _instead(looking, listed, components=None):
     """LinearisedScenes rendered with components [(i, theta)] in place of the present ones."""
-    around = looking.with_components(renumbered(looking.components[i] for i, _ in listed))
+    chosen = components or [looking.components[i] for i, _ in listed]
+    around = looking.with_components(renumbered(chosen))
     scenes, thetas = np.unique(around.scene), [theta for _, theta in listed]
     around.render(scenes, thetas, np.zeros(len(listed)), slopes=False)
     return around

@@ -23,7 +23,7 @@ import numpy as np
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
-from ...sky.sources import PointSource, is_open
+from ...sky.sources import ExtendedSource, PointSource, is_open
 from ..linear.component_batch import StartComponent, renumbered
 from ..linear.linearised_scenes import linearise
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
@@ -32,7 +32,7 @@ from ..view import WhitenedView, pixel_noise
 from .first_profiles import NEED
 from .profile_fit import CHI2_TOL, ProfileFit, start_from
 from .star_weights import allow_for_psf_error
-from .wide_light import n_bands, wide_profiles
+from .wide_light import n_bands, points_in_wide_light, wide_profiles
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -53,6 +53,7 @@ class StartInput:
     thetas (S): for each source None, or the parameters (n,) of each of its components, from which
         it starts; (): None for all
     observations: those of the views, for the PSFs of stars; (): stars of the model's PSF alone
+    given: numbers of the sources that are as the user listed them
     """
 
     frame: Frame
@@ -61,6 +62,7 @@ class StartInput:
     views: list[WhitenedView]
     thetas: tuple = ()
     observations: tuple = ()
+    given: tuple = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,9 @@ class StartingPoint:
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
         of each one's whitened image u. In the views' units
     flux_estimate (S, 3, C), flux_doubt (S, C, k): of the sources' fluxes, by size and wings of each
-        alone, and k changes of all of them by the division of light in pairs; see ProfileFit
+        alone, and k changes of all of them by the division of light in pairs, or by galaxies in
+        place of points; see ProfileFit
+    not_points {source: gain in chi2}: point sources that are better as galaxies
     """
 
     source: np.ndarray
@@ -91,9 +95,17 @@ class StartingPoint:
     spectrum_curvature: np.ndarray
     flux_estimate: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 1)))
     flux_doubt: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 0)))
+    not_points: dict = field(default_factory=dict)
 
     def __len__(self):
         return len(self.shapes)
+
+    def fluxes(self, shape):
+        """Fluxes (S, C) of the sources in a frame of this shape, in the views' units."""
+        found = np.zeros((len(self.positions), self.spectra.shape[1]))
+        for i, spectrum in enumerate(self.spectra):
+            found[self.source[i]] += spectrum * self.drawn(i, (0, 0), shape).sum()
+        return found
 
     def stars(self):
         """Point sources, a list of (StarProfile, its source, position (2,) [px], spectrum (C,))."""
@@ -136,7 +148,50 @@ def _started(patches, fit_sky, tol, second):
             if lower < chi2[b] - NEED - n_bands(fit.looking):
                 points[b] = replace(point, undetected=points[b].undetected)
                 chi2[b] = lower
+    galaxies = _with_galaxies(patches, fit)
+    if galaxies:
+        others = _started([patch for _, patch in galaxies.values()], fit_sky, tol, second)
+        for (b, (changed, patch)), other, lower in zip(galaxies.items(), *others, strict=True):
+            if lower < chi2[b] - NEED - n_bands(fit.looking):
+                points[b] = _doubting(points[b], other, patch, changed, chi2[b] - lower)
     return points, chi2
+
+
+def _with_galaxies(patches, fit):
+    """{scene: (sources (k,), its StartInput with these as galaxies)} of given points in wide light.
+
+    See wide_light.py; fit: the ProfileFit that has ended.
+    """
+    thetas, galaxies = fit.thetas(), {}
+    for i, c in enumerate(fit.looking.components):
+        if c.source in patches[c.scene].given and isinstance(c.shape, StarProfile):
+            shape, place = (
+                GalaxyProfile(patches[c.scene].frame),
+                c.shape.center(thetas[i], c.position),
+            )
+            galaxies[i] = replace(c, shape=shape, position=place)
+    found: dict[int, list] = {}
+    for i in points_in_wide_light(fit, galaxies):
+        found.setdefault(galaxies[i].scene, []).append(i)
+    inputs = {}
+    for b, chosen in found.items():
+        sources, positions = list(patches[b].sources), patches[b].positions.copy()
+        changed = [galaxies[i].source for i in chosen]
+        for i, s in zip(chosen, changed, strict=True):
+            positions[s] = galaxies[i].position
+            sources[s] = ExtendedSource(position_px=tuple(map(float, positions[s])))
+        inputs[b] = changed, replace(patches[b], sources=sources, positions=positions, thetas=())
+    return inputs
+
+
+def _doubting(point, other, patch, changed, gain):
+    """The StartingPoint whose flux_doubt has the changes to another one, better by a gain in chi2.
+
+    patch, changed (k,): as in `_with_galaxies`, of the other one
+    """
+    change = other.fluxes(patch.frame.shape) - point.fluxes(patch.frame.shape)
+    doubt = np.concatenate([point.flux_doubt, change[..., None]], axis=2)
+    return replace(point, flux_doubt=doubt, not_points=dict.fromkeys(changed, float(gain)))
 
 
 def _fitted(patches, fit_sky, tol):

@@ -1,4 +1,4 @@
-"""Finds galaxies with light far wider than their profile: a nucleus within a faint host.
+"""Finds light far wider than a source's profile: of a nucleus' faint host, of a listed point.
 
 One smooth profile is either the nucleus or the host. Structure cannot add what is missing, since it
 is in proportion to the profile: a host of half of a galaxy's light was lost at chi2 of 1. So a
@@ -9,6 +9,11 @@ galaxy whose surroundings hold light in the residuals of the profiles,
 w the whitened image of a wide profile at its place, gets that profile as its second component, and
 all profiles are fitted again. Of several whose wide profiles overlap the one of the largest gain
 has the light; the others are tested in what is then left.
+
+A galaxy that is listed as a point leaves such light as well, if its neighbours do not take it: they
+can grow, and had 4 times their flux, while it had 0.4 of its own. All profiles are fitted again
+with a galaxy in its place, and if that is better, the changes are part of the fluxes' errors, and
+a message names it. A true star among the arms of a galaxy may look so: it stays a point.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.psf import SIGMAS_A_FWHM
+from ..linear.equations import N_PARAMETERS
 from ..linear.spectra import MODEL_ERROR
 from .first_profiles import GROWTH, NEED, apart, products_beside
 
@@ -33,19 +39,36 @@ def wide_profiles(fit, candidates) -> dict:
 
     candidates (N,): bool, components whose source may have more than one; fit.looking is solved
     """
+    chosen = np.flatnonzero(candidates & (_signal_to_noise(fit.looking) > MIN_SNR))
+    around, listed, gain = _in_wide_light(fit, {i: fit.looking.components[i] for i in chosen})
+    return dict(apart(around, listed, gain, _shown(fit, gain))) if listed else {}
+
+
+def points_in_wide_light(fit, galaxies) -> list[int]:
+    """Numbers of the stars with such light, of {component: StartComponent of a galaxy there}."""
+    _, listed, gain = _in_wide_light(fit, galaxies)
+    return sorted({listed[k][0] for k in _shown(fit, gain)})
+
+
+def _in_wide_light(fit, galaxies):
+    """LinearisedScenes of wide profiles about {component: StartComponent}, [(i, theta)], gains."""
     looking, thetas = fit.looking, fit.thetas()
-    chosen = np.flatnonzero(candidates & (_signal_to_noise(looking) > MIN_SNR)).tolist()
-    listed = [(i, wide) for i in chosen for wide in _wider(looking, i, thetas[i])]
+    listed = [(i, wide) for i, c in galaxies.items() for wide in _wider(looking, c, thetas[i])]
     if not listed:
-        return {}
+        return looking, [], np.zeros(0)
     scenes = {int(looking.scene[i]) for i, _ in listed}
     models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, list(scenes)))}
-    around, right, _, alone = products_beside(looking, models, listed, MODEL_ERROR)
+    components = [galaxies[i] for i, _ in listed]
+    around, right, _, alone = products_beside(looking, models, listed, MODEL_ERROR, components)
     square = np.maximum(right, 0) ** 2
     gain = np.divide(square, alone, out=np.zeros_like(alone), where=alone > 0)
-    gain = (gain if looking.ties is None else gain[:, looking.ties.first]).sum(axis=1)
-    shown = np.flatnonzero(gain > NEED + n_bands(looking))
-    return dict(apart(around, listed, gain, shown))
+    gain = gain if looking.ties is None else gain[:, looking.ties.first]
+    return around, listed, gain.sum(axis=1)
+
+
+def _shown(fit, gain):
+    """Places (k,) of gains (n,) that are significant."""
+    return np.flatnonzero(gain > NEED + n_bands(fit.looking))
 
 
 def n_bands(looking):
@@ -59,11 +82,14 @@ def _signal_to_noise(looking):
     return np.sqrt((looking.spectra**2 * power).sum(axis=1))
 
 
-def _wider(looking, i, theta):
-    """Parameters of round profiles about a galaxy that are wider than it."""
-    c = looking.components[i]
-    plans = [sight.views[c.scene].op.plans[0] for sight in looking.sights]
+def _wider(looking, component, theta):
+    """Parameters of round profiles about a StartComponent that are wider than one with theta.
+
+    Those of stars, whose theta has no size, are any.
+    """
+    plans = [sight.views[component.scene].op.plans[0] for sight in looking.sights]
     widths = [p.psfs[1].fwhm_px.min() * abs(np.linalg.det(p.mapping.matrix)) ** 0.5 for p in plans]
     sizes = np.array(WIDTHS) * min(widths) / SIGMAS_A_FWHM
-    sizes = sizes[(sizes > MIN_RATIO * np.exp(theta[0])) & (2 * sizes < max(c.frame))]
-    return [np.array([np.log(size), 0, 0, c.shape.mean[3]]) for size in sizes]
+    own = np.exp(theta[0]) if len(theta) == N_PARAMETERS else 0.0
+    sizes = sizes[(sizes > MIN_RATIO * own) & (2 * sizes < max(component.frame))]
+    return [np.array([np.log(size), 0, 0, component.shape.mean[3]]) for size in sizes]
