@@ -26,8 +26,8 @@ def test_images_beyond_the_observation_have_an_empty_window(low):
     assert not np.asarray(rendered).any()
 
 
-def test_clear_gradients_have_odds_of_150_to_1():
-    asked = GradientTest(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), np.ones((3, 2)), [])
+def test_clear_gradients_have_odds_of_7_to_1():
+    asked = GradientTest(np.array([2, 5, 7]), np.array([1.99, 2.01, -np.inf]), np.ones((3, 2)), [])
     assert asked.significant.tolist() == [5]
 
 
@@ -140,9 +140,13 @@ def test_what_neighbours_leave_nothing_of_is_not_seen():
     np.testing.assert_allclose([values[0], precision[0]], [[0, 0.25], [0, 4]])
 
 
-def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
+def ended(n, losses, *, energies=0.0, determined=0.0, findings=True, fixed=()):
     """A finished fit of n components in three channels."""
-    found = SimpleNamespace(energies=np.full((n, 2), energies), strengths=np.full((n, 2), 0.5))
+    found = SimpleNamespace(
+        energies=np.full((n, 2), energies),
+        strengths=np.full((n, 2), 0.5),
+        n_effective=np.full((n, 2), determined),
+    )
     return SimpleNamespace(
         strength_estimates=found if findings else None,
         state=SimpleNamespace(morph=[0] * n, spectra=np.zeros((n, 3))),
@@ -153,8 +157,8 @@ def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
     )
 
 
-def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
-    """A unit each for three fluxes and a profile's four numbers; and fit the data better."""
+def test_more_components_must_lower_akaikes_criterion_by_what_their_numbers_cost():
+    """A unit each for three fluxes, a profile's four numbers, and what the data determine else."""
     one = ended(2, [200, 100.0])
     assert two_component_fit._is_better(ended(3, [150, 92.9]), one)
     assert not two_component_fit._is_better(ended(3, [150, 93.0]), one)
@@ -163,12 +167,13 @@ def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
     assert not two_component_fit._is_better(ended(3, [150, 50.0], findings=False), one)
     # 20 of 100 are structure's: half of 0.25^-1 of two scales of two components
     stiff = ended(2, [200, 100.0], energies=2.5)
-    assert two_component_fit._half_chi2(stiff) == pytest.approx(80)
-    assert not two_component_fit._is_better(ended(3, [150, 81.0]), stiff)
-    assert two_component_fit._is_better(ended(3, [150, 80.0]), stiff)
-    assert two_component_fit._half_chi2(
-        ended(2, [1, 100.0], energies=2.5, fixed=(0,))
-    ) == pytest.approx(90)
+    assert two_component_fit._criterion(stiff) == pytest.approx(80)
+    assert not two_component_fit._is_better(ended(3, [150, 73.1]), stiff)
+    assert two_component_fit._is_better(ended(3, [150, 72.9]), stiff)
+    noisy = ended(2, [200, 100.0], energies=2.5, determined=10.0, fixed=(0,))
+    assert two_component_fit._criterion(noisy) == pytest.approx(90 + 20)
+    # a lower chi2 by structure that follows the noise does not count
+    assert two_component_fit._is_better(ended(3, [150, 102.9]), noisy)
 
 
 def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):

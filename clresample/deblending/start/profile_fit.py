@@ -89,8 +89,8 @@ class ProfileFit:
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
-            doubted = (self.population.contamination[scenes] > 1).any(axis=1)
-            _run_without_doubt(self, scenes[doubted])
+        doubted = (self.population.contamination[some] > 1).any(axis=1)
+        _run_without_doubt(self, some[doubted])
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
@@ -309,20 +309,25 @@ def _go_on_with_less_doubt(fit, scenes):
 
 
 def _run_without_doubt(fit, scenes):
-    """Fits scenes of a ProfileFit again without contamination of their shapes.
+    """Fits scenes of a ProfileFit again without contamination of shapes that gain by that.
 
     The better fit stays. If one of two similar galaxies has the other one's light, that one's shape
-    is contaminated.
+    is contaminated; so is a disk between two galaxies on its major axis, which then stays round.
     """
-    before = fit._copy()
+    before, chi2 = fit._copy(), fit.chi2_as_expected(scenes)
+    contamination = before[3].contamination[scenes]
     fit.population.contamination[scenes] = 1
-    given = *fit._equations(scenes), fit.population.galaxies[scenes]
-    gain = StepControl(len(fit.theta)).next(scenes, *given)[1]
-    fit._restore(before, scenes[gain <= NEED])
-    scenes = scenes[gain > NEED]
+    _, prior, right, _ = fit._equations(scenes)
+    own = fit.own_equations(scenes)
+    slope = right.reshape(*own.shape[:-1], 1)
+    gain = (slope * np.linalg.solve(own, slope)).sum(axis=(2, 3))
+    fit.population.contamination[scenes] = np.where(gain > NEED, 1, contamination)
+    gained = ((gain > NEED) & (contamination > 1)).any(axis=1)
+    fit._restore(before, scenes[~gained])
+    scenes, chi2 = scenes[gained], chi2[gained]
     if len(scenes):
         penalty = (p.penalty(scenes, fit.theta) for p in (fit.population, before[3]))
         fit.chi2[scenes] += np.subtract(*penalty)
         fit._step(scenes)
         fit._take(scenes)
-        fit._undo(before, scenes[before[0][scenes] <= fit.chi2[scenes]])
+        fit._undo(before, scenes[fit.chi2_as_expected(scenes) > chi2 - NEED])
