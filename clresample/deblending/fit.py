@@ -125,10 +125,21 @@ class Fit:
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
-        self.messages += [_wide_message(self.fitted[i], g) for i, g in point.not_points.items()]
+        self.messages += [self._wide_message(i, gain) for i, gain in point.not_points.items()]
         self._first_shifts, self._going_on = self.shifts, None
         self.restart()
         self.seconds["setup"] += seconds + time.perf_counter() - began
+
+    def _wide_message(self, i_fitted, gain):
+        """Message about a point source that is better as a galaxy, by a gain in chi2."""
+        i = self.fitted[i_fitted]
+        is_free = self.sources[i].free_position
+        return (
+            f"a point source is wider than the PSF{'' if is_free else ', or lies elsewhere'}: with "
+            f"a galaxy in the place of source {i}, chi2 is lower by {gain:.0f}; the errors of "
+            "fluxes hold the difference; list it as an ExtendedSource"
+            f"{'' if is_free else ', or give free_position=True'}"
+        )
 
     def go_on_from(self, state):
         """Replaces the state at the start, here and in `restart`; None: that of the profiles."""
@@ -353,15 +364,6 @@ def _padded_frame(frame, pad):
     """The frame with its sides grown to multiples of `pad`, from the same first pixel on."""
     shape = tuple(round_up(n, pad) for n in frame.shape)
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
-
-
-def _wide_message(i_source, gain):
-    """Message about a point source that is better as a galaxy, by a gain in chi2."""
-    return (
-        "a point source is wider than the PSF, or lies elsewhere: with a galaxy in the place of "
-        f"source {i_source}, chi2 is lower by {gain:.0f}; the errors of fluxes hold the "
-        "difference; list it as an ExtendedSource, or give free_position=True"
-    )
 
 
 def _dark_message(i_source, position):

@@ -157,23 +157,22 @@ def ended(n, losses, *, energies=0.0, determined=0.0, findings=True, fixed=()):
     )
 
 
-def test_more_components_must_lower_akaikes_criterion_by_what_their_numbers_cost():
-    """A unit each for three fluxes, a profile's four numbers, and what the data determine else."""
+def test_second_fits_stay_unless_they_describe_the_data_worse():
+    """By 20 in half chi2 as if structure did not follow the noise; far better: by the loss."""
+    kept, far_better = two_component_fit._is_kept, two_component_fit._is_far_better
     one = ended(2, [200, 100.0])
-    assert two_component_fit._is_better(ended(3, [150, 92.9]), one)
-    assert not two_component_fit._is_better(ended(3, [150, 93.0]), one)
-    assert two_component_fit._is_better(ended(4, [150, 85.9]), one)
-    assert not two_component_fit._is_better(ended(4, [150, 86.1]), one)
-    assert not two_component_fit._is_better(ended(3, [150, 50.0], findings=False), one)
+    assert kept(ended(3, [150, 119.9]), one) and not kept(ended(3, [150, 120.1]), one)
+    assert not kept(ended(3, [150, 50.0], findings=False), one)
+    # a unit each for three fluxes and a profile's four numbers, and 200
+    bright = ended(2, [900, 500.0])
+    assert far_better(ended(3, [900, 292.9]), bright)
+    assert not far_better(ended(3, [900, 293.1]), bright)
+    assert far_better(ended(4, [900, 285.9]), bright)
+    assert not far_better(ended(4, [900, 286.1]), bright)
     # 20 of 100 are structure's: half of 0.25^-1 of two scales of two components
-    stiff = ended(2, [200, 100.0], energies=2.5)
-    assert two_component_fit._criterion(stiff) == pytest.approx(80)
-    assert not two_component_fit._is_better(ended(3, [150, 73.1]), stiff)
-    assert two_component_fit._is_better(ended(3, [150, 72.9]), stiff)
+    assert two_component_fit._half_chi2(ended(2, [200, 100.0], energies=2.5)) == pytest.approx(80)
     noisy = ended(2, [200, 100.0], energies=2.5, determined=10.0, fixed=(0,))
-    assert two_component_fit._criterion(noisy) == pytest.approx(90 + 20)
-    # a lower chi2 by structure that follows the noise does not count
-    assert two_component_fit._is_better(ended(3, [150, 102.9]), noisy)
+    assert two_component_fit._half_chi2(noisy) == pytest.approx(90 + 10)
 
 
 def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
@@ -183,7 +182,8 @@ def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
     again[4].status = Ended.INTERRUPTED
     monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: again)
     monkeypatch.setattr(two_component_fit, "iterate", lambda *given: None)
-    monkeypatch.setattr(two_component_fit, "_is_better", lambda new, old, more=0: new.name != 11)
+    monkeypatch.setattr(two_component_fit, "_is_kept", lambda new, old: new.name != 11)
+    monkeypatch.setattr(two_component_fit, "_is_far_better", lambda new, old: new.name != 11)
     kept = two_component_fit.refit_two_components(firsts, Settings(), None, None)
     assert [one.name for one in kept] == [10, 1, 2, 13, 4]
     assert [one.at["shifts"] for one in firsts] == [9, 1, 2, 9, 4]

@@ -170,7 +170,7 @@ def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch
 
 
 @pytest.mark.parametrize("taken_over", [False, True])
-def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
+def test_what_is_worse_is_not_kept(device, monkeypatch, taken_over):
     """The first fit comes back, as it was; one that was taken over before its end goes on to it."""
     b, _ = blend()
     if not taken_over:
@@ -179,7 +179,7 @@ def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
     monkeypatch.setattr(colour_gradient, "MIN_LOG_EVIDENCE", np.inf)
     plain = deblend(b.observations, b.sources, **given)
     monkeypatch.setattr(colour_gradient, "MIN_LOG_EVIDENCE", -np.inf)
-    monkeypatch.setattr(two_component_fit, "MIN_GAIN", np.inf)
+    monkeypatch.setattr(two_component_fit, "MAX_WORSE", -np.inf)
     tried = deblend(b.observations, b.sources, **given)
     assert tried.seconds["components"] > plain.seconds["components"]
     assert counts(tried) == [1, 1] and tried.status == plain.status

@@ -76,15 +76,10 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
             fit.seconds["fit"] = 2.0
             fit.losses.append(0.5)
 
-    gains = {
-        10: two_component_fit.MIN_DECISIVE_GAIN + 1,
-        11: two_component_fit.MIN_DECISIVE_GAIN - 1,
-        12: -1,
-    }
+    far_better, kept_ones = {10}, {10, 11}
     monkeypatch.setattr(two_component_fit, "iterate", iterate)
-    monkeypatch.setattr(
-        two_component_fit, "_is_better", lambda new, old, more=0: gains[new.name] > more
-    )
+    monkeypatch.setattr(two_component_fit, "_is_far_better", lambda new, _: new.name in far_better)
+    monkeypatch.setattr(two_component_fit, "_is_kept", lambda new, _: new.name in kept_ones)
     told = []
     kept = two_component_fit.refit_two_components(
         firsts, Settings(max_iter=50), None, None, lambda *n: told.append(n)
@@ -137,18 +132,19 @@ def test_a_fit_that_was_taken_over_and_interrupted_says_so(when, monkeypatch):
         "iterate",
         lambda fits, *_: [fit.interrupt() for fit in fits if (fit is new) == (when == "second")],
     )
-    monkeypatch.setattr(two_component_fit, "_is_better", lambda *_: False)
+    for name in ("_is_far_better", "_is_kept"):
+        monkeypatch.setattr(two_component_fit, name, lambda *_: False)
     assert two_component_fit.refit_two_components([first], Settings(), None, None) == [first]
     assert first.status == Ended.INTERRUPTED
 
 
-@pytest.mark.parametrize("evidence", [None, [4.9], [4.9, 5.1]])
+@pytest.mark.parametrize("evidence", [None, [1.9], [1.9, 2.1]])
 def test_a_scene_is_taken_over_where_a_gradient_is_clear(evidence, monkeypatch):
     asked = evidence and GradientTest(
         np.arange(len(evidence)), np.array(evidence), np.ones((3, 2)), []
     )
     monkeypatch.setattr(two_component_fit, "run_gradient_tests", lambda fits: [asked])
-    assert two_component_fit.needs_second_component("fit") == (evidence == [4.9, 5.1])
+    assert two_component_fit.needs_second_component("fit") == (evidence == [1.9, 2.1])
 
 
 def test_a_fit_goes_on_where_nobody_can_tell_what_it_needs(monkeypatch):

@@ -198,7 +198,7 @@ def test_it_is_fitted_side_by_side_as_alone_and_travels(varied, device):
         np.testing.assert_allclose(result.losses[-1], alone.losses[-1], rtol=1e-3)
         # what rounds differently in a batch may end a fit elsewhere, 0.25 of the loss lower
         assert (np.abs(fluxes(result)[0] - flux) < 0.5 * error).all()
-    assert len(many[1].components) == 4
+    assert len(many[1].sources) == 4
     assert observation(alone.observations[0].data).psf_field.varies
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...sky.box import intersect_boxes
+from ..component_images import window_of
 from ..inspection.image import InspectedImage, typical_sigma
 from .misfit import MISFIT_FRACTION
 
@@ -14,36 +16,53 @@ HELD_PART = 0.25
 def beside_unlisted_light(result) -> np.ndarray:
     """Selects sources (S,) whose models hold the light of a peak in `Result.unlisted`.
 
-    They have grown towards it: it is over HELD_PART of the light there and over MISFIT_FRACTION of
-    their own. Sources on their way may have lost light to them, and are selected too: those at
-    whose places they have over MISFIT_FRACTION of the light. Compared is that within an FWHM of the
-    PSF, of all channels of an observation.
+    They have grown towards it: they have over HELD_PART of the light that is observed there, and
+    over MISFIT_FRACTION of their own. Sources on their way may have lost light to them, and are
+    selected too: those at whose places they have over MISFIT_FRACTION of the light. Compared is
+    that within half an FWHM of the PSF, of all channels of an observation.
     """
     found = np.zeros(len(result.sources), bool)
     positions = result.frame.positions_of(result.sources) if result.unlisted else None
     for i in sorted({peak[0] for peak in result.unlisted}):
-        light, whole = _light_at(result, i, [peak[1:] for peak in result.unlisted if peak[0] == i])
-        part = light / np.maximum(light.sum(axis=1, keepdims=True), 1e-300)
-        holding = ((part > HELD_PART) & (light > MISFIT_FRACTION * whole)).any(axis=0)
+        peaks = [peak[1:] for peak in result.unlisted if peak[0] == i]
+        light, observed, whole = _light_at(result, i, peaks)
+        holding = ((light > HELD_PART * observed) & (light > MISFIT_FRACTION * whole)).any(axis=0)
         image = InspectedImage.of(result.observations[i], result.frame, positions, result.shifts[i])
-        light, _ = _light_at(result, i, image.places[image.inside])
-        found[image.inside] |= light[:, holding].sum(axis=1) > MISFIT_FRACTION * light.sum(axis=1)
+        light, observed, _ = _light_at(result, i, image.places[image.inside])
+        taken = light[:, holding].sum(axis=1) > MISFIT_FRACTION * observed[:, 0]
+        found[image.inside] |= taken
         found |= holding
     return found
 
 
 def _light_at(result, i, places):
-    """Light (n, S) of the sources' models at places (n, 2) [px] of an image, and in all (S,).
+    """Light of the sources' models at places (n, 2) [px] of an image, what is observed, and all.
 
-    [sigma of a typical pixel], the sum of the image's channels.
+    (n, S), (n, 1), and (S,) of the models [sigma of a typical pixel], sums of the image's channels;
+    observed is at least the light of all models.
     """
-    observation, channels = result.observations[i], result.channel_slices()[i]
-    pixels = np.indices(observation.data.shape[1:])[:, None]
-    away = np.hypot(*(pixels - np.asarray(places).T[..., None, None]))
-    near = away <= observation.psf.fwhm_px.max()
-    at, whole = np.zeros((len(places), len(result.sources))), np.zeros(len(result.sources))
-    for image, c in zip(result.rendered[i], result.components, strict=True):
-        spectrum = c.spectrum[channels] / typical_sigma(observation.weights)
-        at[:, c.source] += np.einsum("c,cyx,nyx->n", spectrum, image, near)
-        whole[c.source] += spectrum.sum() * c.morphology.sum()
-    return at, whole
+    o, channels = result.observations[i], result.channel_slices()[i]
+    unit, radius = typical_sigma(o.weights), np.median(o.psf.fwhm_px) / 2
+    data = np.where(o.weights > 0, o.data - result.sky[channels, None, None], 0)
+    shape, half = data.shape[1:], int(np.ceil(radius))
+    lows = np.rint(places).astype(int).reshape(-1, 2) - half
+    light, observed = np.zeros((len(lows), len(result.sources))), np.zeros((len(lows), 1))
+    boxes = np.indices((2 * half + 1,) * 2)
+    near = [
+        np.hypot(*(boxes + (low - at)[:, None, None])) <= radius
+        for low, at in zip(lows, places, strict=True)
+    ]
+    for k, low in enumerate(lows):
+        here, there = intersect_boxes((0, 0), shape, low, near[k].shape)
+        observed[k] = (data[:, *here] * near[k][*there]).sum((1, 2)) @ (1 / unit)
+    whole = np.zeros(len(result.sources))
+    for c, component in enumerate(result.components):
+        spectrum, s = component.spectrum[channels] / unit, component.source
+        whole[s] += spectrum.sum() * component.morphology.sum()
+        window = window_of(result.rendered[i], c)
+        image = result.rendered[i][c][:, *window]
+        start = [part.start for part in window]
+        for k, low in enumerate(lows):
+            here, there = intersect_boxes(start, image.shape[1:], low, near[k].shape)
+            light[k, s] += spectrum @ (image[:, *here] * near[k][*there]).sum((1, 2))
+    return light, np.maximum(observed, light.sum(axis=1, keepdims=True)), whole

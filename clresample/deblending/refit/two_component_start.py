@@ -92,7 +92,7 @@ def _together(fit, chosen):
         elif isinstance(begin.shapes[own[0]], GalaxyProfile):
             profile = np.maximum(begin.drawn(own[0], (0, 0), fit.frame.shape), 0)  # rounding
             sources[i] = replace(source, profile=profile, n_components=None)
-    return replace(fit.patch, sources=sources, thetas=thetas)
+    return replace(fit.patch, sources=sources, thetas=thetas, given=())
 
 
 def _split(theta):

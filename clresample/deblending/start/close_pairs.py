@@ -48,12 +48,14 @@ def run_from_equal_profiles(fit, scenes):
     fit._look(scenes, fit.theta, slopes=False)
     rest = fit.looking.without_light(fit.looking.spectra)
     windows = [_windows(fit.looking, sight, groups) for sight in rest.sights]
-    fit.flux_doubt = np.zeros((*fit.looking.spectra.shape, N_ENDS * len(groups)))
+    doubt = np.zeros((*fit.looking.spectra.shape, N_ENDS * len(groups)))
     pairs = zip(rest.sights, windows, strict=True)
     n_pixels = sum(sight.n_bands * int(np.prod(size)) for sight, (_, size) in pairs)
     for some in portions(len(groups), N_ENDS * BYTES_A_PIXEL * n_pixels):
         cuts = [(np.tile(low[some], (N_ENDS, 1)), size) for low, size in windows]
-        moved += _best_ends(fit, rest, groups[some], cuts, some.start)
+        columns = doubt[..., N_ENDS * some.start : N_ENDS * some.stop]
+        moved += _best_ends(fit, rest, groups[some], cuts, columns)
+    fit.flux_doubt = np.concatenate([fit.flux_doubt, doubt], axis=2)
     fit.population.contamination[*np.array(fit.at)[:, moved]] = 1
     again = np.unique(fit.looking.scene[moved])
     fit._take(again, doubt=False)
@@ -62,12 +64,11 @@ def run_from_equal_profiles(fit, scenes):
     fit._undo(before, np.intersect1d(again, scenes[~better]))
 
 
-def _best_ends(fit, rest, groups, windows, first):
+def _best_ends(fit, rest, groups, windows, doubt):
     """Fits close pairs to their best ends, all other light held; the components (k,) that moved.
 
-    Stores the changes of fluxes to the other ends, of the groups from number `first` on.
-
     rest: LinearisedScenes without any light; windows: of the groups in each observation
+    doubt (N, C, N_ENDS * n_groups): filled with the changes of fluxes to the other ends
     """
     members = [(g, i) for g, own in enumerate(groups) for i in sorted({*own, *own.values()})]
     group, chosen = np.array(members).T
@@ -100,7 +101,7 @@ def _best_ends(fit, rest, groups, windows, first):
     weight, here = expit((chi2.min(axis=0) - chi2) / NEED), (best, np.arange(n_all))
     change = np.sqrt(weight[:, group])[..., None] * (flux - flux[here])
     for k in range(N_ENDS):
-        fit.flux_doubt[chosen, :, N_ENDS * (first + group) + k] = change[k]
+        doubt[chosen, :, N_ENDS * group + k] = change[k]
     moved = best > 0
     fit.theta[*np.array(fit.at)[:, chosen[moved]]] = theta[here][moved]
     fit.looking.spectra[chosen[moved]] = spectra[here][moved]

@@ -148,7 +148,7 @@ def _started(patches, fit_sky, tol, second):
             if lower < chi2[b] - NEED - n_bands(fit.looking):
                 points[b] = replace(point, undetected=points[b].undetected)
                 chi2[b] = lower
-    galaxies = _with_galaxies(patches, fit)
+    galaxies = _with_galaxies(patches, fit) if tol < NEED else {}
     if galaxies:
         others = _started([patch for _, patch in galaxies.values()], fit_sky, tol, second)
         for (b, (changed, patch)), other, lower in zip(galaxies.items(), *others, strict=True):
@@ -160,7 +160,7 @@ def _started(patches, fit_sky, tol, second):
 def _with_galaxies(patches, fit):
     """{scene: (sources (k,), its StartInput with these as galaxies)} of given points in wide light.
 
-    See wide_light.py; fit: the ProfileFit that has ended.
+    See wide_light.py; fit: the ProfileFit that has ended, to a smaller tolerance than NEED.
     """
     thetas, galaxies = fit.thetas(), {}
     for i, c in enumerate(fit.looking.components):
@@ -180,7 +180,9 @@ def _with_galaxies(patches, fit):
         for i, s in zip(chosen, changed, strict=True):
             positions[s] = galaxies[i].position
             sources[s] = ExtendedSource(position_px=tuple(map(float, positions[s])))
-        inputs[b] = changed, replace(patches[b], sources=sources, positions=positions, thetas=())
+        known = [None if s in changed else theta for s, theta in enumerate(patches[b].thetas)]
+        given = {"sources": sources, "positions": positions, "thetas": tuple(known), "given": ()}
+        inputs[b] = changed, replace(patches[b], **given)
     return inputs
 
 
@@ -227,7 +229,7 @@ def _with_wide_light(patches, fit, points):
                 own = components[i].source
                 sources[own] = replace(sources[own], n_components=2)
                 thetas[own].append(wide)
-        inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas))
+        inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas), given=())
     return inputs
 
 

@@ -46,8 +46,8 @@ def wide_profiles(fit, candidates) -> dict:
 
 def points_in_wide_light(fit, galaxies) -> list[int]:
     """Numbers of the stars with such light, of {component: StartComponent of a galaxy there}."""
-    _, listed, gain = _in_wide_light(fit, galaxies)
-    return sorted({listed[k][0] for k in _shown(fit, gain)})
+    around, listed, gain = _in_wide_light(fit, galaxies)
+    return sorted(i for i, _ in apart(around, listed, gain, _shown(fit, gain))) if listed else []
 
 
 def _in_wide_light(fit, galaxies):
