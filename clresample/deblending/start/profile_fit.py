@@ -99,8 +99,10 @@ class ProfileFit:
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
-        doubted = (self.population.contamination[some] > 1).any(axis=1)
-        _run_without_doubt(self, some[doubted])
+        doubted = some[(self.population.contamination[some] > 1).any(axis=1)]
+        _run_without_doubt(self, np.intersect1d(doubted, scenes))
+        others = np.setdiff1d(doubted, scenes)
+        _run_without_doubt(self, others[~self.is_known[others]], again=True)
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
@@ -382,30 +384,33 @@ def _go_on_with_less_doubt(fit, scenes):
     fit._step(scenes, learn=True)
 
 
-def _run_without_doubt(fit, scenes):
+def _run_without_doubt(fit, scenes, *, again=False):
     """Fits scenes of a ProfileFit again without contamination of their shapes.
 
     If one of two similar galaxies has the other one's light, that one's shape is contaminated; so
     is a disk between two galaxies on its major axis, which then stays round while they have its
-    ends. So scenes in which that may gain MIN_GAIN are fitted without doubt, from where they are,
-    from galaxies that have the light of those about them, and from profiles of large galaxies. The
-    best one of these ends stays if it gains 2 NEED and E^2, as much as errors of the neighbours'
-    models may feign (population.py): below that structure decides, and flux errors hold the changes
-    to the others, as those of close_pairs.py. Galaxies far fainter than others stay doubted.
+    ends. So scenes in which that may gain NEED are fitted without doubt from where they are. The
+    best end stays if it gains 2 NEED and E^2, as much as errors of the neighbours' models may
+    feign (population.py): below that structure decides, and flux errors hold the changes to the
+    others, as those of close_pairs.py. Galaxies far fainter than others stay doubted.
+
+    again: if they may gain MIN_GAIN, and with two more starts: from galaxies that have the light of
+        those about them, and from profiles of large galaxies, as scenes of large ones begin
     """
     before, here = fit._copy(), fit.chi2_as_expected(scenes)
     doubted = np.where(_is_bright(fit, scenes), 1, fit.population.contamination[scenes])
     feigned = (fit.population.contamination[scenes] - doubted).max(axis=1)
     fit.population.contamination[scenes] = doubted
     given = *fit._equations(scenes), fit.population.galaxies[scenes]
-    may_gain = StepControl(len(fit.theta)).next(scenes, *given)[1] > MIN_GAIN
+    may_gain = StepControl(len(fit.theta)).next(scenes, *given)[1] > (MIN_GAIN if again else NEED)
     fit._restore(before, scenes[~may_gain])
     scenes, doubted = scenes[may_gain], doubted[may_gain]
     here, feigned = here[may_gain], feigned[may_gain]
     if not len(scenes):
         return
     ends, best, lowest = [(here, _fluxes(fit))], before, np.full(len(scenes), np.inf)
-    for begin in (None, _begin_with_merged_galaxies, _begin_with_large_galaxies):
+    begins = (_begin_with_merged_galaxies, _begin_with_large_galaxies) if again else ()
+    for begin in (None, *begins):
         fit._restore(before, scenes)
         if begin is not None:
             begin(fit, scenes)
