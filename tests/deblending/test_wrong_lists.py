@@ -60,6 +60,14 @@ def test_sources_that_hold_an_unlisted_ones_light_are_flagged(device, tmp_path):
     assert read_result(tmp_path / "blend.fits").unlisted == result.unlisted
 
 
+def test_a_star_beside_an_unlisted_one_is_not_flagged(device):
+    """Its model has some of the light there, which is not what is observed."""
+    point = (*BRIGHT[:2], 0.0)
+    drawn = (point, FAR, ((30.2, 39.0), 2500.0, 0.0))
+    result = fitted(scene(drawn, listed=drawn[:2], kinds=(PointSource, ExtendedSource)), device)
+    assert result.unlisted and not beside_unlisted_light(result).any()
+
+
 def test_a_whole_list_has_no_unlisted_light(device):
     drawn = (BRIGHT, FAR, ((42, 44), 2500.0, 1.5))
     result = fitted(scene(drawn), device)

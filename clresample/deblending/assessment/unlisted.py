@@ -25,21 +25,21 @@ def beside_unlisted_light(result) -> np.ndarray:
     positions = result.frame.positions_of(result.sources) if result.unlisted else None
     for i in sorted({peak[0] for peak in result.unlisted}):
         peaks = [peak[1:] for peak in result.unlisted if peak[0] == i]
-        light, observed, whole = _light_at(result, i, peaks)
+        every = np.ones(len(found), bool)
+        light, observed, whole = _light_at(result, i, peaks, every)
         holding = ((light > HELD_PART * observed) & (light > MISFIT_FRACTION * whole)).any(axis=0)
         image = InspectedImage.of(result.observations[i], result.frame, positions, result.shifts[i])
-        light, observed, _ = _light_at(result, i, image.places[image.inside])
-        taken = light[:, holding].sum(axis=1) > MISFIT_FRACTION * observed[:, 0]
-        found[image.inside] |= taken
+        light, observed, _ = _light_at(result, i, image.places[image.inside], holding)
+        found[image.inside] |= light.sum(axis=1) > MISFIT_FRACTION * observed[:, 0]
         found |= holding
     return found
 
 
-def _light_at(result, i, places):
-    """Light of the sources' models at places (n, 2) [px] of an image, what is observed, and all.
+def _light_at(result, i, places, chosen):
+    """Light of models at places (n, 2) [px] of an image, what is observed there, and all of theirs.
 
-    (n, S), (n, 1), and (S,) of the models [sigma of a typical pixel], sums of the image's channels;
-    observed is at least the light of all models.
+    (n, S), (n, 1) and (S,) [sigma of a typical pixel], sums of the image's channels; 0 of models
+    but those chosen (S,). At least their light is observed.
     """
     o, channels = result.observations[i], result.channel_slices()[i]
     unit, radius = typical_sigma(o.weights), np.median(o.psf.fwhm_px) / 2
@@ -48,16 +48,16 @@ def _light_at(result, i, places):
     lows = np.rint(places).astype(int).reshape(-1, 2) - half
     light, observed = np.zeros((len(lows), len(result.sources))), np.zeros((len(lows), 1))
     boxes = np.indices((2 * half + 1,) * 2)
-    near = [
-        np.hypot(*(boxes + (low - at)[:, None, None])) <= radius
-        for low, at in zip(lows, places, strict=True)
-    ]
+    pairs = zip(lows, places, strict=True)
+    near = [np.hypot(*(boxes + (low - at)[:, None, None])) <= radius for low, at in pairs]
     for k, low in enumerate(lows):
         here, there = intersect_boxes((0, 0), shape, low, near[k].shape)
         observed[k] = (data[:, *here] * near[k][*there]).sum((1, 2)) @ (1 / unit)
     whole = np.zeros(len(result.sources))
     for c, component in enumerate(result.components):
         spectrum, s = component.spectrum[channels] / unit, component.source
+        if not chosen[s]:
+            continue
         whole[s] += spectrum.sum() * component.morphology.sum()
         window = window_of(result.rendered[i], c)
         image = result.rendered[i][c][:, *window]

@@ -26,11 +26,11 @@ from ..linear.rendered_models import model_of, render_models
 # and discs. With half or twice that, evidences differ by a few; gradients over 3 % are detected in
 # bright galaxies in any case.
 CORE_COLOUR_SCATTER = 0.3
-# ln of the ratio of evidences from which a second fit is tried: odds of 7 to 1, since that fit must
-# be better besides. Of 254 simulated galaxies of one colour each, 5 reach it, because negative
-# light in COSMOS images, which no model can fit, mimics a gradient in instruments of different
-# resolution, and 4 get a second component. With odds of 150 to 1 colours of red bulges in blue
-# disks are 2.3 errors off in the mean at signal to noise 200 (r_e = 0.5", Euclid and Rubin).
+# ln of the ratio of evidences from which a second fit is tried: odds of 7 to 1. Of 254 simulated
+# galaxies of one colour each, 3 to 5 reach it, because negative light in COSMOS images, which no
+# model can fit, mimics a gradient in instruments of different resolution. With odds of 150 to 1
+# colours of red bulges in blue disks are 2.3 errors off in the mean at signal to noise 200
+# (r_e = 0.5", Euclid and Rubin).
 MIN_LOG_EVIDENCE = 2.0
 # Signal to noise from which a source is tested: below it no gradient can be significant.
 MIN_SNR = 30.0

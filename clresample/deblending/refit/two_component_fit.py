@@ -21,8 +21,8 @@ MAX_WORSE = 20.0
 MIN_GAIN = 1.0
 N_PROFILE = 4
 # [loss] Additional decrease, beyond MIN_GAIN, of a second fit over such a first fit; if it is not
-# reached, the first fit is continued to its end before both are compared. The
-# value is twice the largest gain of continued fits of HST and HSC, and of a bright blend of HSC.
+# reached, the first fit is continued to its end before both are compared. The value is twice the
+# largest gain of continued fits of HST and HSC, and of a bright blend of HSC.
 MIN_DECISIVE_GAIN = 200.0
 # Largest number of iterations of a second fit in units of `max_iter`. A first fit that was stopped
 # has not used all of its own, and one in 40 fits of a bright blend of HSC needs more than 1.5.
