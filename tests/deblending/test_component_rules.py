@@ -26,8 +26,10 @@ def test_images_beyond_the_observation_have_an_empty_window(low):
     assert not np.asarray(rendered).any()
 
 
-def test_clear_gradients_have_odds_of_7_to_1():
-    asked = GradientTest(np.array([2, 5, 7]), np.array([1.99, 2.01, -np.inf]), np.ones((3, 2)), [])
+def test_clear_gradients_have_odds_of_7_to_1_for_each_that_is_tested():
+    asked = GradientTest(
+        np.array([2, 5, 7]), 2 + np.log(3) + np.array([-0.01, 0.01, -np.inf]), np.ones((3, 2)), []
+    )
     assert asked.significant.tolist() == [5]
 
 

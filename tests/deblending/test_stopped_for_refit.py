@@ -138,13 +138,13 @@ def test_a_fit_that_was_taken_over_and_interrupted_says_so(when, monkeypatch):
     assert first.status == Ended.INTERRUPTED
 
 
-@pytest.mark.parametrize("evidence", [None, [1.9], [1.9, 2.1]])
+@pytest.mark.parametrize("evidence", [None, [1.9], [2.6, 2.8]])
 def test_a_scene_is_taken_over_where_a_gradient_is_clear(evidence, monkeypatch):
     asked = evidence and GradientTest(
         np.arange(len(evidence)), np.array(evidence), np.ones((3, 2)), []
     )
     monkeypatch.setattr(two_component_fit, "run_gradient_tests", lambda fits: [asked])
-    assert two_component_fit.needs_second_component("fit") == (evidence == [1.9, 2.1])
+    assert two_component_fit.needs_second_component("fit") == (evidence == [2.6, 2.8])
 
 
 def test_a_fit_goes_on_where_nobody_can_tell_what_it_needs(monkeypatch):

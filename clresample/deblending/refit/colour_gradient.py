@@ -26,7 +26,8 @@ from ..linear.rendered_models import model_of, render_models
 # and discs. With half or twice that, evidences differ by a few; gradients over 3 % are detected in
 # bright galaxies in any case.
 CORE_COLOUR_SCATTER = 0.3
-# ln of the ratio of evidences from which a second fit is tried: odds of 7 to 1. Of 254 simulated
+# ln of the ratio of evidences from which a second fit is tried: odds of 7 to 1, times the number of
+# tested sources, since any of these has all fitted again. Of 254 simulated
 # galaxies of one colour each, 3 to 5 reach it, because negative light in COSMOS images, which no
 # model can fit, mimics a gradient in instruments of different resolution. With odds of 150 to 1
 # colours of red bulges in blue disks are 2.3 errors off in the mean at signal to noise 200
@@ -56,7 +57,8 @@ class GradientTest:
     @property
     def significant(self):
         """The components that significantly need a second one."""
-        return self.components[self.evidence > MIN_LOG_EVIDENCE]
+        least = MIN_LOG_EVIDENCE + np.log(max(len(self.components), 1))
+        return self.components[self.evidence > least]
 
 
 def run_gradient_tests(fits):

@@ -36,6 +36,9 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 GROWN = 1.5
 # Smallest gain in chi2 that a step without doubt promises, for a fit without it.
 MIN_GAIN = 12.0
+# Largest number of components of a scene that has more than one start without doubt: large profiles
+# of all of them at once take 7 GB of 300.
+MAX_AGAIN = 30
 # Smallest correlation of the images of two galaxies that may have each other's light, and distance
 # of one from the middle of all such light, in units of the size of that.
 MIN_ALIKE, MAX_ASIDE = 0.003, 0.3
@@ -102,7 +105,8 @@ class ProfileFit:
         doubted = some[(self.population.contamination[some] > 1).any(axis=1)]
         _run_without_doubt(self, np.intersect1d(doubted, scenes))
         others = np.setdiff1d(doubted, scenes)
-        _run_without_doubt(self, others[~self.is_known[others]], again=True)
+        few = (self.source[others] >= 0).sum(axis=1) <= MAX_AGAIN
+        _run_without_doubt(self, others[few & ~self.is_known[others]], again=True)
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
