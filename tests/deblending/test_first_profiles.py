@@ -37,7 +37,7 @@ def sized(device, monkeypatch):
             kept.append(np.array([theta[0] for theta in fit.thetas()]))
             return large
 
-        monkeypatch.setattr(profile_fit, "first_profiles", noted)
+        monkeypatch.setattr(first_profiles_module, "first_profiles", noted)
         one = Fit(blend(objects, shape=(96, 96), seed=5), Settings(), device, np.float32, pad=1)
         start_fits([one])
         return *(kept or (None, None)), np.array([theta[0] for theta in one.start.thetas])
@@ -73,7 +73,7 @@ def test_a_first_profile_takes_no_neighbours_light_into_its_wings(device, monkey
         wings.extend(theta[3] for theta in fit.thetas())
         return large
 
-    monkeypatch.setattr(profile_fit, "first_profiles", noted)
+    monkeypatch.setattr(first_profiles_module, "first_profiles", noted)
     scene = scene_of("pair", "one", 41901, 14, Limits(largest_re_px=20))
     pair = Blend(scene.observations, scene.sources)
     start_fits([Fit(pair, Settings(), device, np.float32, pad=1)])
@@ -127,7 +127,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
         fit._take(scenes)
         measured.append((kept, fit.chi2[scenes]))
 
-    monkeypatch.setattr(profile_fit, "_run_without_doubt", noted)
+    monkeypatch.setattr(profile_fit, "run_without_doubt", noted)
     sized([GIANT, ((60.0, 52.0), GIANT[1], 11.0), ((44.0, 40.0), (9e3, 8e3, 7e3), 1.5)], spoilt)
     ((kept, again),) = measured
     assert len(kept)

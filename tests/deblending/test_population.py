@@ -8,7 +8,7 @@ from clresample import Settings
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
-from clresample.deblending.start import population, profile_fit
+from clresample.deblending.start import population
 from clresample.deblending.start.population import (
     GALAXY_SCATTER,
     LEARNED,
@@ -22,6 +22,7 @@ from clresample.deblending.start.population import (
     em_step,
 )
 from clresample.deblending.start.profile_fit import ProfileFit
+from clresample.deblending.start.without_doubt import run_without_doubt
 
 
 def shrunk(data, noise, mean, scatter):
@@ -276,7 +277,7 @@ def test_two_bright_galaxies_that_are_alike_have_their_own_shapes(device, monkey
         fit.theta[0, 1] = np.log(1.5), 0, 0, np.log(6.5)
         fit._take(np.arange(1))
         assert fit.population.contamination[0, 1] > 10
-        profile_fit._run_without_doubt(fit, np.arange(1))
+        run_without_doubt(fit, np.arange(1))
 
     if spoilt:
         monkeypatch.setattr(ProfileFit, "run", run)

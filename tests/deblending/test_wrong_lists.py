@@ -62,8 +62,7 @@ def test_sources_that_hold_an_unlisted_ones_light_are_flagged(device, tmp_path):
 
 def test_a_star_beside_an_unlisted_one_is_not_flagged(device):
     """Its model has some of the light there, which is not what is observed."""
-    point = (*BRIGHT[:2], 0.0)
-    drawn = (point, FAR, ((30.2, 39.0), 2500.0, 0.0))
+    drawn = (POINT, FAR, ((30.2, 39.0), 2500.0, 0.0))
     result = fitted(scene(drawn, listed=drawn[:2], kinds=(PointSource, ExtendedSource)), device)
     assert result.unlisted and not beside_unlisted_light(result).any()
 

@@ -22,10 +22,10 @@ def beside_unlisted_light(result) -> np.ndarray:
     that within half an FWHM of the PSF, of all channels of an observation.
     """
     found = np.zeros(len(result.sources), bool)
+    every = np.ones_like(found)
     positions = result.frame.positions_of(result.sources) if result.unlisted else None
     for i in sorted({peak[0] for peak in result.unlisted}):
         peaks = [peak[1:] for peak in result.unlisted if peak[0] == i]
-        every = np.ones(len(found), bool)
         light, observed, whole = _light_at(result, i, peaks, every)
         holding = ((light > HELD_PART * observed) & (light > MISFIT_FRACTION * whole)).any(axis=0)
         image = InspectedImage.of(result.observations[i], result.frame, positions, result.shifts[i])

@@ -27,11 +27,10 @@ from ..linear.rendered_models import model_of, render_models
 # bright galaxies in any case.
 CORE_COLOUR_SCATTER = 0.3
 # ln of the ratio of evidences from which a second fit is tried: odds of 7 to 1, times the number of
-# tested sources, since any of these has all fitted again. Of 254 simulated
-# galaxies of one colour each, 3 to 5 reach it, because negative light in COSMOS images, which no
-# model can fit, mimics a gradient in instruments of different resolution. With odds of 150 to 1
-# colours of red bulges in blue disks are 2.3 errors off in the mean at signal to noise 200
-# (r_e = 0.5", Euclid and Rubin).
+# tested sources, since any of these has all fitted again. Of 254 simulated galaxies of one colour
+# each, 3 to 5 reach it, because negative light in COSMOS images, which no model can fit, mimics a
+# gradient in instruments of different resolution. With odds of 150 to 1 colours of red bulges in
+# blue disks are 2.3 errors off in the mean at signal to noise 200 (r_e = 0.5", Euclid and Rubin).
 MIN_LOG_EVIDENCE = 2.0
 # Signal to noise from which a source is tested: below it no gradient can be significant.
 MIN_SNR = 30.0

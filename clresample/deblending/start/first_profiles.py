@@ -20,8 +20,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..linear.component_batch import renumbered
+from ..linear.spectra import MODEL_ERROR
 from ..profiles import GalaxyProfile
-from .population import NEIGHBOUR_MODEL_ERROR
+from .population import NEIGHBOUR_MODEL_ERROR, OWN_LIGHT
 
 # Ratio of successive sizes: least squares converge from half of it.
 GROWTH = 3.0
@@ -69,6 +70,16 @@ def profile_grid(looking, scenes, thetas, error) -> dict:
     for own in grid.values():
         own += [np.array([*theta[:3], np.log(WIDE_WINGS)]) for theta in own]
     return grid
+
+
+def begin_with_large_galaxies(fit, scenes):
+    """Sets the parameters of scenes (k,) of a ProfileFit anew; which have large galaxies (k,)."""
+    fit.theta[scenes] = fit.expected.mean[scenes]
+    fit.population.reset(scenes, fit.expected)
+    fit.population.own_light[scenes] = OWN_LIGHT
+    fit._look(scenes, fit.theta, slopes=False)
+    fit.looking.solve(MODEL_ERROR)
+    return first_profiles(fit, scenes, MODEL_ERROR)[scenes].any(axis=1)
 
 
 def first_profiles(fit, scenes, error):
