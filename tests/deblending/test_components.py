@@ -78,7 +78,7 @@ def counts(result):
 def by_second_fits():
     """Second components by second fits: a start finds that of this galaxy too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(profile_start, "wide_profiles", lambda fit, candidates: {})
+        patch.setattr(profile_start, "second_profiles", lambda fit, candidates: {})
         yield
 
 

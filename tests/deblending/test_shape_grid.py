@@ -8,7 +8,7 @@ from helpers.scenes import MODEL_PSF, frame
 
 from clresample import ExtendedSource, Grid, Observation, Settings, deblend
 from clresample.deblending.profiles import profile, psf_second_moment
-from clresample.deblending.start import profile_fit, shape_grid
+from clresample.deblending.start import alternatives, profile_fit, shape_grid
 from clresample.deblending.start.population import LEARNED, PopulationPrior
 from clresample.deblending.start.shape_grid import (
     FAR_STEPS,
@@ -59,7 +59,8 @@ def fitted(device, monkeypatch):
 @pytest.mark.parametrize("n, fit_sky", [(1, False), (1, True), (3, False), (3, True)])
 def test_gains_are_differences_of_chi2(fitted, monkeypatch, n, fit_sky):
     """With a sky level and with exposures of a band; fluxes are of the light in the frame."""
-    monkeypatch.setattr(shape_grid, "MODEL_ERROR", 0.0)  # weights that stay as the sky changes
+    for module in (alternatives, profile_fit):
+        monkeypatch.setattr(module, "MODEL_ERROR", 0.0)  # weights that stay as the sky changes
     image, compared = galaxy(2.5, 2.0, 16) + fit_sky * 0.05, []
 
     def looked(fit, scenes):

@@ -56,7 +56,7 @@ def test_the_host_of_a_nucleus_is_its_second_component(device):
 def test_without_it_the_hosts_light_is_lost(device, monkeypatch):
     """At the noise's chi2: no message would say so."""
     b = scene()
-    monkeypatch.setattr(profile_start, "wide_profiles", lambda fit, candidates: {})
+    monkeypatch.setattr(profile_start, "second_profiles", lambda fit, candidates: {})
     flux, error, n = fluxes(deblend(b.observations, b.sources, frame=b.frame, device=device))
     assert n == 1 and NUCLEUS + HOST - flux > 10 * error
 

@@ -152,12 +152,10 @@ def _next(looking, models, rest, error):
     return dict(apart(around, listed, gain, at))
 
 
-def products_beside(looking, models, listed, error, components=None):
+def products_beside(looking, models, listed, error):
     """LinearisedScenes of components [(i, theta)], and three products (n, C) of their images.
 
     With the data minus the models {component: theta}, with the data, and with themselves.
-
-    components (n): StartComponents in place of those listed
     """
     sky, modelled = looking.sky.copy(), np.zeros(0, int)
     if models:
@@ -166,7 +164,7 @@ def products_beside(looking, models, listed, error, components=None):
         before.compute_residuals(error)
         modelled = before.scenes
         sky[modelled] = before.sky[modelled]
-    around = _instead(looking, listed, components)
+    around = _instead(looking, listed)
     right = np.zeros((len(listed), looking.n_channels))
     for sight in around.sights:
         right[around.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0]
@@ -180,9 +178,9 @@ def products_beside(looking, models, listed, error, components=None):
 def apart(around, listed, gain, at):
     """Selects the components of the largest gain (n,) at these places, with disjoint boxes.
 
-    listed (n): components; at: the places among them that compete
+    listed (n): components, the first of `around`; at: the places among them that compete
     """
-    low, high = np.zeros((2, len(listed), 2))
+    low, high = np.zeros((2, len(around.components), 2))
     slots = around.slots
     low[around.at], high[around.at] = slots.origin, slots.origin + slots.pixel[:, None] * slots.size
     taken: list[int] = []
@@ -193,10 +191,9 @@ def apart(around, listed, gain, at):
     return [listed[k] for k in taken]
 
 
-def _instead(looking, listed, components=None):
+def _instead(looking, listed):
     """LinearisedScenes rendered with components [(i, theta)] in place of the present ones."""
-    chosen = components or [looking.components[i] for i, _ in listed]
-    around = looking.with_components(renumbered(chosen))
+    around = looking.with_components(renumbered(looking.components[i] for i, _ in listed))
     scenes, thetas = np.unique(around.scene), [theta for _, theta in listed]
     around.render(scenes, thetas, np.zeros(len(listed)), slopes=False)
     return around

@@ -33,9 +33,6 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # (bench.ladder, seed 4401), at up to a fifth less time. With ln 3 more of the scenes that gain
 # nothing from it are started again (bench.throughput).
 GROWN = 1.5
-# Largest number of components of a scene that has more than one start without doubt: large profiles
-# of all of them at once take 7 GB of 300.
-MAX_AGAIN = 30
 
 
 class ProfileFit:
@@ -94,10 +91,7 @@ class ProfileFit:
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
         doubted = some[(self.population.contamination[some] > 1).any(axis=1)]
-        run_without_doubt(self, np.intersect1d(doubted, scenes))
-        others = np.setdiff1d(doubted, scenes)
-        few = (self.source[others] >= 0).sum(axis=1) <= MAX_AGAIN
-        run_without_doubt(self, others[few & ~self.is_known[others]], again=True)
+        run_without_doubt(self, doubted[~self.is_known[doubted] | np.isin(doubted, scenes)])
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
@@ -138,7 +132,7 @@ class ProfileFit:
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
             if doubt:
-                self._doubt(scenes)
+                self.doubt(scenes)
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
@@ -195,6 +189,11 @@ class ProfileFit:
         slopes = slopes & self.moves[self.at]
         self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
+    def solve_shapes(self, scenes):
+        """Renders and solves scenes (k,) with their present shapes."""
+        self._look(scenes, self.theta, slopes=False)
+        self.looking.solve(MODEL_ERROR)
+
     def _chi2(self, scenes, theta):
         """With the priors (k,)."""
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
@@ -208,18 +207,19 @@ class ProfileFit:
         """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.own_equations(scenes))
-        self._doubt(scenes)
+        self.doubt(scenes)
         increase = self.population.penalty(scenes, self.theta) - before
         self.chi2[scenes] += increase
         return increase
 
-    def _doubt(self, scenes):
-        """Stores the shape errors caused by neighbours, for some of the scenes solved last."""
+    def doubt(self, scenes):
+        """Stores the contamination (k, n) of some of the scenes solved last."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
         prior = (a[scenes] for a in (self.source, self.population.stars, self.population.own_light))
         self.population.set_contamination(scenes, contamination_factors(normal, spectra, *prior))
+        return self.population.contamination[scenes]
 
     def _take_equations(self, scenes):
         """Stores the normal equations of some of the scenes rendered last."""

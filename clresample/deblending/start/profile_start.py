@@ -32,7 +32,7 @@ from ..view import WhitenedView, pixel_noise
 from .first_profiles import NEED
 from .profile_fit import CHI2_TOL, ProfileFit, start_from
 from .star_weights import allow_for_psf_error
-from .wide_light import n_bands, points_in_wide_light, wide_profiles
+from .wide_light import n_bands, points_in_wide_light, second_profiles
 
 # Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
 # and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4. With the
@@ -141,10 +141,10 @@ def _started(patches, fit_sky, tol, second):
     """The StartingPoints and chi2 (B,) of patches, see `fit_start_profiles`."""
     fit, points = _fitted(patches, fit_sky, tol)
     chi2 = fit.chi2_at_end.copy()
-    wider = _with_wide_light(patches, fit, points) if second else {}
-    if wider:
-        again = _started(list(wider.values()), fit_sky, tol, second)
-        for b, point, lower in zip(wider, *again, strict=True):
+    several = _with_second_components(patches, fit, points) if second else {}
+    if several:
+        again = _started(list(several.values()), fit_sky, tol, second)
+        for b, point, lower in zip(several, *again, strict=True):
             if lower < chi2[b] - NEED - n_bands(fit.looking):
                 points[b] = replace(point, undetected=points[b].undetected)
                 chi2[b] = lower
@@ -213,23 +213,34 @@ def _fitted(patches, fit_sky, tol):
     return fit, [_point(patch, fit, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
 
 
-def _with_wide_light(patches, fit, points):
-    """{scene: its StartInput with second components} of a ProfileFit, see wide_light.py."""
+def _with_second_components(patches, fit, points):
+    """{scene: its StartInput with second components} of a ProfileFit, see wide_light.py.
+
+    Galaxies that may have grown into what one component left begin anew.
+    """
     components = fit.looking.components
     free = [is_open(patches[c.scene].sources[c.source]) for c in components]
-    found = wide_profiles(fit, np.array(free))
+    found = second_profiles(fit, np.array(free))
+    if not found:
+        return {}
+    scenes = np.unique(fit.looking.scene[list(found)])
+    fit.solve_shapes(scenes)
+    doubted = fit.doubt(scenes) > NEED
     inputs = {}
-    for b in sorted({components[i].scene for i in found}):
+    for b, anew in zip(scenes.tolist(), doubted, strict=True):
         begin, sources = points[b], list(patches[b].sources)
         thetas: list = [[] for _ in sources]
         for i, theta in zip(begin.source, begin.thetas, strict=True):
             thetas[i].append(theta)
-        for i, wide in found.items():
+        for i, theta in found.items():
             if components[i].scene == b:
                 own = components[i].source
                 sources[own] = replace(sources[own], n_components=2)
-                thetas[own].append(wide)
-        inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas), given=())
+                thetas[own].append(theta)
+        anew = {begin.source[k] for k in np.flatnonzero(anew[: len(begin)])}
+        anew -= {components[i].source for i in found if components[i].scene == b}
+        known = tuple(None if s in anew else theta for s, theta in enumerate(thetas))
+        inputs[b] = replace(patches[b], sources=sources, thetas=known, given=())
     return inputs
 
 

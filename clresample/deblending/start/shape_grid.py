@@ -7,6 +7,8 @@ the flux of every profile u is solved for, with neighbours as they are, which ch
     -gain = -sum_c max(0, b)^2 / p,    b = <u, r>,    p = <u, u>,
 
 where r is the data minus the models of all others, and the sky's level is eliminated from b and p.
+Of far larger profiles it is at most `contamination` times what errors of the neighbours' models
+leave of it, see alternatives.py.
 If a profile is better than the fitted one, the scene is fitted again from it. The weights
 
     exp(gain / (2 contamination)) ((1 - UNUSUAL) prior + UNUSUAL / (SIZE_RANGE WINGS_RANGE))
@@ -35,9 +37,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..linear.component_batch import peaks_of, renumbered
-from ..linear.spectra import MODEL_ERROR
 from ..profiles import GalaxyGaussians, GalaxyProfile
+from .alternatives import Alternatives
 from .first_profiles import NEED
 from .population import LEARNED
 
@@ -171,40 +172,35 @@ def _grids(fit, components):
 
 def _computed(fit, components):
     """Pairs of some components and their ShapeGrids."""
-    looking, scenes = fit.looking, np.unique(fit.looking.scene[components])
-    fit._look(scenes, fit.theta, slopes=False)
-    looking.solve(MODEL_ERROR)
-    looking.compute_residuals(MODEL_ERROR)
+    looking, thetas = fit.looking, fit.thetas()
+    fit.solve_shapes(np.unique(looking.scene[components]))
     row, present = looking.rows_of(looking.scene[components]), looking.spectra[components]
     power = looking.normal[row, :, looking.index[components], looking.index[components]]
     explained = (np.square(present) * power).sum(axis=1)
-    thetas, (off, level) = fit.thetas(), (a[row] for a in looking.of_level())
-    own = [
-        _alternatives(thetas[i], far=light < MAX_FAR_GAIN)
+    own = {
+        i: _alternatives(thetas[i], far=light < MAX_FAR_GAIN)
         for i, light in zip(components, explained, strict=True)
-    ]
-    owner, theta = np.repeat(np.arange(len(own)), [len(a) for a in own]), np.concatenate(own)
-    first = np.flatnonzero(np.diff(owner, prepend=-1))
-    listed = renumbered(looking.components[components[q]] for q in owner)
-    peaks, around = peaks_of(listed, theta), looking.with_components(listed)
-    brightness = fit.brightness[components][owner] * np.minimum(peaks / peaks[first][owner], 1)
-    around.render(scenes, theta, brightness, slopes=False)
-    right, alone, sky = _products(around, present, owner, first)
+    }
+    found = Alternatives(fit, own)
+    off, level = (a[row] for a in looking.of_level())
+    right, alone, owner = found.right, found.alone, found.owner
     if looking.fit_sky:
-        off = (off + present * sky[first])[owner]
-        part = np.divide(sky, level[owner], out=np.zeros_like(sky), where=level[owner] > 0)
-        right, alone = right - part * off, alone - part * sky
-    if looking.ties is not None:
-        right, alone = (looking.ties.spread(looking.ties.total(a)) for a in (right, alone))
+        off = (off + present * found.level[found.first])[owner]
+        part = found.level / np.where(level > 0, level, np.inf)[owner]
+        right, alone = right - part * off, alone - part * found.level
+    right, alone = found.tied(right), found.tied(alone)
     flux = np.divide(right, alone, out=np.zeros_like(right), where=alone > 0)
-    gain = np.maximum(right, 0) * flux
-    gain = gain if looking.ties is None else gain[:, looking.ties.first]
-    inside = part_inside(listed, theta)[:, None]
+    contamination = fit.population.contamination[fit.at][found.component]
+    gain = found.full_gain(right, alone)
+    certain = np.minimum(gain, contamination * found.certain_gain(right, alone))
+    n_near = 1 + len(SIZE_STEPS) * len(LN_BETA)
+    gain = np.where(np.arange(len(gain)) - found.first[owner] < n_near, gain, certain)
+    inside = part_inside(found.listed, np.array(found.theta))[:, None]
     variance = np.divide(inside**2, alone, out=np.zeros_like(alone), where=alone > 0)
-    parts = gain.sum(axis=1), flux * inside, variance
+    parts = gain, flux * inside, variance
     for q, i in enumerate(components):
         at = looking.scene[i], looking.index[i]
-        yield i, ShapeGrid(*at, own[q], *(part[owner == q] for part in parts))
+        yield i, ShapeGrid(*at, own[i], *(part[owner == q] for part in parts))
 
 
 def _alternatives(theta, *, far):
@@ -217,28 +213,6 @@ def _alternatives(theta, *, far):
     step, out[1:, 3] = np.array(pairs).T
     out[1:, 0] += step
     return out
-
-
-def _products(around, present, owner, first):
-    """Products (n, C) of alternatives with the data without others, with themselves, with a level.
-
-    present (q, C): spectra of the present profiles, the `first` (q,) of each owner's; owner (n,)
-    """
-    right, alone, sky = np.zeros((3, len(owner), present.shape[1]))
-    is_first = np.isin(np.arange(len(owner)), first)
-    for sight, (table, _) in zip(around.sights, around.overlapping_pairs, strict=True):
-        one, other = around.at[table[:, :2]].T
-        use = (owner[one] == owner[other]) & ((one == other) | is_first[one] | is_first[other])
-        one, other, channels = one[use], other[use], sight.channels
-        gram = sight.gram(around.device.put(table[use].astype(np.int32)), 1)[..., 0, 0]
-        pull = sight.residual_products(1)[:, :, 0]
-        right[around.at, channels], sky[around.at, channels] = np.moveaxis(pull, -1, 0)
-        same, own = one == other, present[owner[one]][:, channels] * gram
-        alone[one[same], channels] = gram[same]
-        right[one[is_first[other]], channels] += own[is_first[other]]
-        turned = is_first[one] & ~same
-        right[other[turned], channels] += own[turned]
-    return right, alone, sky
 
 
 def part_inside(components, theta):

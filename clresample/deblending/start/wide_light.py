@@ -1,14 +1,20 @@
-"""Finds light far wider than a source's profile: of a nucleus' faint host, of a listed point.
+"""Finds light that a source's one profile leaves: of a faint host, of a core of another colour.
 
 One smooth profile is either the nucleus or the host. Structure cannot add what is missing, since it
 is in proportion to the profile: a host of half of a galaxy's light was lost at chi2 of 1. So a
-galaxy whose surroundings hold light in the residuals of the profiles,
+galaxy whose surroundings hold light in the residuals of the profiles, in which a wide one has a
+significant gain (alternatives.py), gets that profile as its second component, and all profiles are
+fitted again. Of several whose wide profiles overlap the one of the largest gain has the light; the
+others are tested in what is then left.
 
-    gain = sum_c max(0, <w, r>)^2 / |w|^2,
+One profile of a galaxy whose core has another colour may be wrong by more than
+NEIGHBOUR_MODEL_ERROR in some bands, and faint sources about it grow into what it leaves: one of
+signal to noise 1800 had 0.37 of its flux in one band. If the core is resolved in all images, a
+narrower profile with the whitened image u has the gain of another colour than its spectrum A,
 
-w the whitened image of a wide profile at its place, gets that profile as its second component, and
-all profiles are fitted again. Of several whose wide profiles overlap the one of the largest gain
-has the light; the others are tested in what is then left.
+    sum_c <u, r>^2 / |u|^2 - (sum_c A <u, r>)^2 / sum_c A^2 |u|^2,
+
+r the residuals, less the same of its own profile.
 
 A galaxy that is listed as a point leaves such light as well, if its neighbours do not take it: they
 can grow, and had 4 times their flux, while it had 0.4 of its own. All profiles are fitted again
@@ -22,8 +28,8 @@ import numpy as np
 
 from ...sky.psf import SIGMAS_A_FWHM
 from ..linear.equations import N_PARAMETERS
-from ..linear.spectra import MODEL_ERROR
-from .first_profiles import GROWTH, NEED, apart, products_beside
+from .alternatives import Alternatives
+from .first_profiles import GROWTH, NEED, apart
 
 # Sigmas of wide profiles, in that of the sharpest PSF. Wider ones would take up what is left of the
 # sky: 0.05 sigma a pixel within 9 times a PSF of 3.5 px gains 5.
@@ -34,41 +40,46 @@ MIN_RATIO = 2.0
 MIN_SNR = 30.0
 
 
-def wide_profiles(fit, candidates) -> dict:
+def second_profiles(fit, candidates) -> dict:
     """Parameters of second components: {component: theta (4,)} of a ProfileFit that has ended.
 
     candidates (N,): bool, components whose source may have more than one; fit.looking is solved
     """
     chosen = np.flatnonzero(candidates & (_signal_to_noise(fit.looking) > MIN_SNR))
-    around, listed, gain = _in_wide_light(fit, {i: fit.looking.components[i] for i in chosen})
-    return dict(apart(around, listed, gain, _shown(fit, gain))) if listed else {}
+    galaxies = {i: fit.looking.components[i] for i in chosen}
+    return _significant(fit, galaxies, (_wider, _narrower), Alternatives.certain_gain)
 
 
 def points_in_wide_light(fit, galaxies) -> list[int]:
     """Numbers of the stars with such light, of {component: StartComponent of a galaxy there}."""
-    around, listed, gain = _in_wide_light(fit, galaxies)
-    return sorted(i for i, _ in apart(around, listed, gain, _shown(fit, gain))) if listed else []
+    return sorted(_significant(fit, galaxies, (_wider,), Alternatives.full_gain))
 
 
-def _in_wide_light(fit, galaxies):
-    """LinearisedScenes of wide profiles about {component: StartComponent}, [(i, theta)], gains."""
-    looking, thetas = fit.looking, fit.thetas()
-    listed = [(i, wide) for i, c in galaxies.items() for wide in _wider(looking, c, thetas[i])]
-    if not listed:
-        return looking, [], np.zeros(0)
-    scenes = {int(looking.scene[i]) for i, _ in listed}
-    models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, list(scenes)))}
-    components = [galaxies[i] for i, _ in listed]
-    around, right, _, alone = products_beside(looking, models, listed, MODEL_ERROR, components)
-    square = np.maximum(right, 0) ** 2
-    gain = np.divide(square, alone, out=np.zeros_like(alone), where=alone > 0)
-    gain = gain if looking.ties is None else gain[:, looking.ties.first]
-    return around, listed, gain.sum(axis=1)
+def _significant(fit, galaxies, kinds, gain_of):
+    """Profiles {component: theta} of significant gains, which do not overlap.
 
-
-def _shown(fit, gain):
-    """Places (k,) of gains (n,) that are significant."""
-    return np.flatnonzero(gain > NEED + n_bands(fit.looking))
+    galaxies: {component: StartComponent of a galaxy}; kinds: functions that give profiles of it
+    gain_of: the function that gives the gains of wider ones
+    """
+    thetas, own = fit.thetas(), {}
+    for i, c in galaxies.items():
+        others = [theta for kind in kinds for theta in kind(fit.looking, c, thetas[i])]
+        if others:
+            own[i] = [thetas[i], *others]
+    if not own:
+        return {}
+    fit.solve_shapes(np.unique(fit.looking.scene[list(own)]))
+    found = Alternatives(fit, own, galaxies)
+    products = found.tied(found.right - found.explained), found.tied(found.alone)
+    colour = found.colour_gain(*products, fit.looking.spectra[found.component])
+    sizes = np.array([_ln_sigma(theta) for theta in found.theta])
+    narrower = sizes < sizes[found.first][found.owner]
+    of_present = colour[found.first][found.owner]
+    gain = np.where(narrower, colour - of_present, gain_of(found, *products))
+    gain[found.first] = 0
+    shown = np.flatnonzero(gain > NEED + n_bands(fit.looking))
+    listed = list(zip(found.component.tolist(), found.theta, strict=True))
+    return dict(apart(found.around, listed, gain, shown))
 
 
 def n_bands(looking):
@@ -82,14 +93,28 @@ def _signal_to_noise(looking):
     return np.sqrt((looking.spectra**2 * power).sum(axis=1))
 
 
-def _wider(looking, component, theta):
-    """Parameters of round profiles about a StartComponent that are wider than one with theta.
+def _ln_sigma(theta):
+    """Of a galaxy's parameters; those of a star, which are fewer, have none."""
+    return theta[0] if len(theta) == N_PARAMETERS else -np.inf
 
-    Those of stars, whose theta has no size, are any.
-    """
+
+def _psf_sigmas(looking, component):
+    """Sigmas [px] of the sharpest PSF of each observation of a StartComponent's scene."""
     plans = [sight.views[component.scene].op.plans[0] for sight in looking.sights]
     widths = [p.psfs[1].fwhm_px.min() * abs(np.linalg.det(p.mapping.matrix)) ** 0.5 for p in plans]
-    sizes = np.array(WIDTHS) * min(widths) / SIGMAS_A_FWHM
-    own = np.exp(theta[0]) if len(theta) == N_PARAMETERS else 0.0
+    return np.array(widths) / SIGMAS_A_FWHM
+
+
+def _wider(looking, component, theta):
+    """Parameters of round profiles about a StartComponent that are wider than one with theta."""
+    sizes = np.array(WIDTHS) * _psf_sigmas(looking, component).min()
+    own = np.exp(_ln_sigma(theta))
     sizes = sizes[(sizes > MIN_RATIO * own) & (2 * sizes < max(component.frame))]
     return [np.array([np.log(size), 0, 0, component.shape.mean[3]]) for size in sizes]
+
+
+def _narrower(looking, component, theta):
+    """Those of one that is narrower, if all observations resolve it."""
+    core = theta[0] - np.log(GROWTH)
+    resolved = np.exp(core) > _psf_sigmas(looking, component).max()
+    return [np.array([core, *theta[1:3], component.shape.mean[3]])] if resolved else []
