@@ -120,9 +120,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
     """The first start comes back with its doubt: chi2 is then that of the state solved anew."""
     measured = []
 
-    def noted(fit, scenes, again=False):
-        if again:  # of small galaxies
-            return
+    def noted(fit, scenes):
         kept = fit.chi2[scenes].copy()
         fit._take(scenes)
         measured.append((kept, fit.chi2[scenes]))

@@ -22,21 +22,22 @@ from .population import NEIGHBOUR_MODEL_ERROR, STAR_MODEL_ERROR
 class Alternatives:
     """Profiles of some components of a ProfileFit, of each the present one and then others.
 
-    fit: of which the components' scenes were rendered and solved last
+    The scenes of these components must be those that `fit.looking` rendered and solved last. Its
+    equations and solution stay; what it renders is replaced.
 
     own: {component: [theta (p,), ...]}, the present ones first
     instead: {component: StartComponent} whose profiles the others are; by default its own
+    faint: draw profiles as far as where they are faint beside the noise, else beside their peaks
 
     component, owner (n,): of each profile, and its place in `own`; first (q,): the present ones
-    listed (n): StartComponents; theta (n): their parameters
-    around: LinearisedScenes of these, and of all stars beside them
+    listed (n): StartComponents; theta (n): their parameters; around: their LinearisedScenes
     right, alone, level (n, C): products with r, with themselves, and with a level of 1
     explained (n, C): part of `right` by the present profile
     wrong (n, C): products with the errors of other models; those of stars are STAR_MODEL_ERROR
     """
 
-    def __init__(self, fit, own, instead=None):
-        looking, thetas, instead = fit.looking, fit.thetas(), instead or {}
+    def __init__(self, fit, own, instead=None, *, faint=True):
+        looking, instead = fit.looking, instead or {}
         counts = [len(some) for some in own.values()]
         self.component = np.repeat(list(own), counts)
         self.owner = np.repeat(np.arange(len(own)), counts)
@@ -45,73 +46,69 @@ class Alternatives:
         self.listed = [instead.get(i, looking.components[i]) for i in self.component]
         for k in self.first:
             self.listed[k] = looking.components[self.component[k]]
-        scenes = np.unique(looking.scene[self.component])
-        stars = np.flatnonzero(np.isin(looking.scene, scenes) & fit.population.stars[fit.at])
-        looking.compute_residuals(MODEL_ERROR)
+        stars, spectra = fit.population.stars[fit.at][:, None], looking.spectra
+        parts = [_residuals(looking, part) for part in (0 * spectra, spectra * stars, spectra)]
         peaks = peaks_of(self.listed, self.theta)
-        brightness = fit.brightness[self.component]
+        brightness = fit.brightness[self.component] * faint
         brightness *= np.minimum(peaks / peaks[self.first][self.owner], 1)
-        self.listed = renumbered(self.listed)
-        self.around = looking.with_components(
-            renumbered([*self.listed, *(looking.components[i] for i in stars)])
-        )
-        theta = [*self.theta, *(thetas[i] for i in stars)]
-        brightness = np.append(brightness, fit.brightness[stars])
-        self.around.render(scenes, theta, brightness, slopes=False)
-        self._multiply(np.append(self.component, stars), looking.spectra, looking.sky)
+        self.around = looking.with_components(renumbered(self.listed))
+        scenes = np.unique(self.around.scene)
+        self.around.render(scenes, self.theta, brightness, slopes=False)
+        (light, _), (unstarred, _), (rest, self.level) = (self._products(part) for part in parts)
+        self.alone, self.explained = self._products_of_own(spectra)
+        self.right = rest + self.explained
+        others = unstarred + self.explained * stars[self.component] - self.right
+        self.wrong = NEIGHBOUR_MODEL_ERROR * others + STAR_MODEL_ERROR * (light - unstarred)
 
-    def _multiply(self, component, spectra, sky):
-        """Computes the products; component (n + stars,); spectra (N, C) and sky of the fit."""
-        around, n, n_all = self.around, len(self.owner), len(component)
-        right, alone, level, light, own, of_stars = np.zeros((6, n_all, spectra.shape[1]))
-        is_first, is_star = np.isin(np.arange(n_all), self.first), np.arange(n_all) >= n
-        none, level_sky = around.put(np.zeros_like(right)), around.put(sky)
-        for sight, (table, _) in zip(around.sights, around.overlapping_pairs, strict=True):
-            one, other = around.at[table[:, :2]].T
-            same = (component[one] == component[other]) & ~(is_star[one] | is_star[other])
-            use = np.where(same, is_first[one] | is_first[other], is_star[one] != is_star[other])
-            use |= one == other
-            gram = sight.gram(around.device.put(table[use].astype(np.int32)), 1)[..., 0, 0]
-            one, other, c = one[use], other[use], sight.channels
-            right[around.at, c], level[around.at, c] = np.moveaxis(
-                sight.residual_products(1)[:, :, 0], -1, 0
+    def _products(self, residuals):
+        """Products (n, C) with these residuals of each sight, and with a level of 1."""
+        found = np.zeros((2, len(self.owner), self.around.n_channels))
+        for sight, residual in zip(self.around.sights, residuals, strict=True):
+            sight.residual = residual
+            pull = sight.residual_products(1)[:, :, 0]
+            found[:, self.around.at, sight.channels] = np.moveaxis(pull, -1, 0)
+        return found
+
+    def _products_of_own(self, spectra):
+        """Products (n, C) of profiles with themselves and with the present models of the same."""
+        alone, explained = np.zeros((2, len(self.owner), self.around.n_channels))
+        is_first = np.isin(np.arange(len(self.owner)), self.first)
+        for sight, (table, _) in zip(
+            self.around.sights, self.around.overlapping_pairs, strict=True
+        ):
+            one, other = self.around.at[table[:, :2]].T
+            use = self.owner[one] == self.owner[other]
+            use &= (one == other) | is_first[one] | is_first[other]
+            gram = sight.gram(self.around.device.put(table[use].astype(np.int32)), 1)[..., 0, 0]
+            a, b = np.where(is_first[other], (one, other), (other, one))[:, use]
+            same = one[use] == other[use]
+            alone[one[use][same], sight.channels] = gram[same]
+            seen = is_first[b]
+            explained[a[seen], sight.channels] = (
+                spectra[self.component[b[seen]]][:, sight.channels] * gram[seen]
             )
-            alone[one[one == other], c] = gram[one == other]
-            twice = np.flatnonzero(one != other)
-            a, b = np.concatenate([(one, other), (other[twice], one[twice])], axis=1)
-            seen = spectra[component[b]][:, c] * np.concatenate([gram, gram[twice]])
-            same = component[a] == component[b]
-            for into, some in ((own, same & is_first[b]), (of_stars, ~same & is_star[b])):
-                np.add.at(into[:, c], a[some], seen[some])
-            sight.compute_residuals(around.scenes, around.slots, none, level_sky, MODEL_ERROR)
-            light[around.at, c] = sight.residual_products(1)[:, :, 0, 0]
-        right += own
-        wrong = NEIGHBOUR_MODEL_ERROR * (light - right)
-        wrong -= (NEIGHBOUR_MODEL_ERROR - STAR_MODEL_ERROR) * of_stars
-        self.right, self.alone, self.level, self.explained, self.wrong = (
-            values[:n] for values in (right, alone, level, own, wrong)
-        )
+        return alone, explained
 
     def full_gain(self, right, alone):
-        """Gains (n,) of products (n, C) with the data and with themselves.
-
-        Both are tied, and may be without the sky's level.
-        """
-        square = np.maximum(right, 0) ** 2
-        return self.total(np.divide(square, alone, out=np.zeros_like(alone), where=alone > 0))
+        """Gains (n,) of products (n, C) with the data and with themselves, sums as of `tied`."""
+        return self.total(_quotient(np.maximum(right, 0) ** 2, alone))
 
     def certain_gain(self, right, alone):
-        """The same with the neighbours' errors."""
-        return self.full_gain(right, np.where(alone > 0, alone + self.tied(self.wrong) ** 2, 0))
+        """Gains (n,) of such products with the errors of other models."""
+        return self.total(_quotient(np.maximum(right, 0) ** 2, self._variance(alone)))
 
     def colour_gain(self, right, alone, spectra):
-        """Gains (n,) of both signs, beyond those of one colour: that of spectra (n, C)."""
-        each = np.divide(right**2, alone, out=np.zeros_like(alone), where=alone > 0)
-        power = np.maximum(self.total(spectra**2 * alone), 1e-300)
-        return self.total(each) - self.total(spectra * right) ** 2 / power
+        """Gains (n,) of free spectra with these errors, beyond those in proportion to one (n, C).
+
+        Free ones may be negative.
+        """
+        variance = self._variance(alone)
+        part = self.total(_quotient(spectra * alone * right, variance)) ** 2
+        power = self.total(_quotient((spectra * alone) ** 2, variance))
+        return self.total(_quotient(right**2, variance)) - _quotient(part, power)
 
     def tied(self, values):
-        """Products (n, C) of each channel as sums over those of its band."""
+        """Products (n, C), those of all channels of a band summed."""
         ties = self.around.ties
         return values if ties is None else ties.spread(ties.total(values))
 
@@ -119,3 +116,24 @@ class Alternatives:
         """Sums (n,) of values (n, C) over the bands."""
         ties = self.around.ties
         return (values if ties is None else values[:, ties.first]).sum(axis=1)
+
+    def _variance(self, alone):
+        return np.where(alone > 0, alone + self.tied(self.wrong) ** 2, 0)
+
+
+def _residuals(looking, spectra):
+    """The data less models with spectra (N, C), on the device, in each observation.
+
+    looking: LinearisedScenes
+    """
+    kept, looking.spectra = looking.spectra, spectra
+    for sight in looking.sights:
+        sight.residual = sight.device.empty(sight.root.shape, sight.dtype)
+    looking.compute_residuals(MODEL_ERROR)
+    looking.spectra = kept
+    return [sight.residual for sight in looking.sights]
+
+
+def _quotient(a, b):
+    """a / b, 0 where b is."""
+    return np.divide(a, b, out=np.zeros_like(b), where=b > 0)

@@ -77,8 +77,7 @@ def begin_with_large_galaxies(fit, scenes):
     fit.theta[scenes] = fit.expected.mean[scenes]
     fit.population.reset(scenes, fit.expected)
     fit.population.own_light[scenes] = OWN_LIGHT
-    fit._look(scenes, fit.theta, slopes=False)
-    fit.looking.solve(MODEL_ERROR)
+    fit.solve_shapes(scenes)
     return first_profiles(fit, scenes, MODEL_ERROR)[scenes].any(axis=1)
 
 

@@ -33,6 +33,9 @@ MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
 # (bench.ladder, seed 4401), at up to a fifth less time. With ln 3 more of the scenes that gain
 # nothing from it are started again (bench.throughput).
 GROWN = 1.5
+# Largest number of components of a scene of small galaxies that is fitted without doubt: ends are
+# compared for whole scenes, and that of 300 sources took a third of the start for nothing.
+MAX_FREED = 30
 
 
 class ProfileFit:
@@ -50,7 +53,7 @@ class ProfileFit:
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
         is common to all channels, and that of each band, see shape_grid.py; 0 for others
-    flux_doubt (N, C, k): changes of fluxes, each of close pairs, see close_pairs.py
+    flux_doubt (N, C, k): changes of fluxes, see without_doubt.py and close_pairs.py
     """
 
     def __init__(self, looking: LinearisedScenes, noise, tol=CHI2_TOL):
@@ -91,7 +94,9 @@ class ProfileFit:
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
         doubted = some[(self.population.contamination[some] > 1).any(axis=1)]
-        run_without_doubt(self, doubted[~self.is_known[doubted] | np.isin(doubted, scenes)])
+        few = (self.source[doubted] >= 0).sum(axis=1) <= MAX_FREED
+        new = few & ~self.is_known[doubted]
+        run_without_doubt(self, doubted[new | np.isin(doubted, scenes)])
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
@@ -132,7 +137,7 @@ class ProfileFit:
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
             if doubt:
-                self.doubt(scenes)
+                self.update_contamination(scenes)
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
@@ -207,13 +212,13 @@ class ProfileFit:
         """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.own_equations(scenes))
-        self.doubt(scenes)
+        self.update_contamination(scenes)
         increase = self.population.penalty(scenes, self.theta) - before
         self.chi2[scenes] += increase
         return increase
 
-    def doubt(self, scenes):
-        """Stores the contamination (k, n) of some of the scenes solved last."""
+    def update_contamination(self, scenes):
+        """Stores and returns the contamination (k, n) of some of the scenes solved last."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
@@ -261,13 +266,13 @@ def start_from(fit, known):
     for i in galaxies:
         fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
     scenes = np.unique(fit.looking.scene[galaxies])
-    grown = _growth(fit)[scenes].max(axis=1) > MAX_GROWTH
+    grown = growth(fit)[scenes].max(axis=1) > MAX_GROWTH
     fit.is_known[scenes], fit.begun = True, np.maximum(fit.theta, fit.begun)
     fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
 
 
-def _growth(fit, begun=None):
+def growth(fit, begun=None):
     """ln sigma (B, n) of galaxies beyond the expected one, or that of `begun`; 0 of others."""
     begun = fit.expected.mean if begun is None else begun
     return (fit.theta - begun)[..., 0] * fit.expected.galaxies
@@ -275,7 +280,7 @@ def _growth(fit, begun=None):
 
 def _have_grown(fit):
     """Selects scenes (B,) with a galaxy that has grown by GROWN since it began."""
-    return _growth(fit, fit.begun).max(axis=1) > GROWN
+    return growth(fit, fit.begun).max(axis=1) > GROWN
 
 
 def _may_hold_large_galaxies(fit):
@@ -285,7 +290,7 @@ def _may_hold_large_galaxies(fit):
     leaves structure to be fitted, so that its smooth profiles never explain all of the data.
     """
     unexplained = (fit.chi2 > MAX_CHI2 * fit.looking.n_pixels()) & ~fit.is_known
-    return (_growth(fit, fit.begun).max(axis=1) > MAX_GROWTH) | unexplained
+    return (growth(fit, fit.begun).max(axis=1) > MAX_GROWTH) | unexplained
 
 
 def _run_from_large_galaxies(fit, scenes):

@@ -30,7 +30,7 @@ from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..sampled_psf import sampled_psfs
 from ..view import WhitenedView, pixel_noise
 from .first_profiles import NEED
-from .profile_fit import CHI2_TOL, ProfileFit, start_from
+from .profile_fit import CHI2_TOL, MAX_GROWTH, ProfileFit, growth, start_from
 from .star_weights import allow_for_psf_error
 from .wide_light import n_bands, points_in_wide_light, second_profiles
 
@@ -132,7 +132,7 @@ def fit_start_profiles(
 
     patches: of equal numbers of observations, these of equal shapes
     fit_sky: also a level per channel; tol: see ProfileFit
-    second: give galaxies in light that is far wider a second component, see wide_light.py
+    second: give galaxies second components for far wider light and cores, see wide_light.py
     """
     return _started(patches, fit_sky, tol, second)[0]
 
@@ -216,31 +216,27 @@ def _fitted(patches, fit_sky, tol):
 def _with_second_components(patches, fit, points):
     """{scene: its StartInput with second components} of a ProfileFit, see wide_light.py.
 
-    Galaxies that may have grown into what one component left begin anew.
+    Others that have grown, and whose shapes its errors may feign, begin anew.
     """
     components = fit.looking.components
     free = [is_open(patches[c.scene].sources[c.source]) for c in components]
     found = second_profiles(fit, np.array(free))
     if not found:
         return {}
-    scenes = np.unique(fit.looking.scene[list(found)])
-    fit.solve_shapes(scenes)
-    doubted = fit.doubt(scenes) > NEED
-    inputs = {}
-    for b, anew in zip(scenes.tolist(), doubted, strict=True):
+    scenes, inputs = np.unique(fit.looking.scene[list(found)]), {}
+    feigned = (fit.update_contamination(scenes) > NEED) & (growth(fit)[scenes] > MAX_GROWTH)
+    for b, anew in zip(scenes.tolist(), feigned, strict=True):
         begin, sources = points[b], list(patches[b].sources)
         thetas: list = [[] for _ in sources]
-        for i, theta in zip(begin.source, begin.thetas, strict=True):
-            thetas[i].append(theta)
+        for i, theta, again in zip(begin.source, begin.thetas, anew[: len(begin)], strict=True):
+            if not again:
+                thetas[i].append(theta)
         for i, theta in found.items():
             if components[i].scene == b:
                 own = components[i].source
                 sources[own] = replace(sources[own], n_components=2)
                 thetas[own].append(theta)
-        anew = {begin.source[k] for k in np.flatnonzero(anew[: len(begin)])}
-        anew -= {components[i].source for i in found if components[i].scene == b}
-        known = tuple(None if s in anew else theta for s, theta in enumerate(thetas))
-        inputs[b] = replace(patches[b], sources=sources, thetas=known, given=())
+        inputs[b] = replace(patches[b], sources=sources, thetas=tuple(thetas), given=())
     return inputs
 
 

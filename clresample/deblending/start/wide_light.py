@@ -14,7 +14,7 @@ narrower profile with the whitened image u has the gain of another colour than i
 
     sum_c <u, r>^2 / |u|^2 - (sum_c A <u, r>)^2 / sum_c A^2 |u|^2,
 
-r the residuals, less the same of its own profile.
+r the residuals, with the errors of other models, less the same of its own profile.
 
 A galaxy that is listed as a point leaves such light as well, if its neighbours do not take it: they
 can grow, and had 4 times their flux, while it had 0.4 of its own. All profiles are fitted again
@@ -69,7 +69,7 @@ def _significant(fit, galaxies, kinds, gain_of):
     if not own:
         return {}
     fit.solve_shapes(np.unique(fit.looking.scene[list(own)]))
-    found = Alternatives(fit, own, galaxies)
+    found = Alternatives(fit, own, galaxies, faint=False)
     products = found.tied(found.right - found.explained), found.tied(found.alone)
     colour = found.colour_gain(*products, fit.looking.spectra[found.component])
     sizes = np.array([_ln_sigma(theta) for theta in found.theta])
@@ -98,11 +98,12 @@ def _ln_sigma(theta):
     return theta[0] if len(theta) == N_PARAMETERS else -np.inf
 
 
-def _psf_sigmas(looking, component):
-    """Sigmas [px] of the sharpest PSF of each observation of a StartComponent's scene."""
+def _psf_sigmas(looking, component, widest=False):
+    """Sigmas [px] of the sharpest, or widest, PSF of each observation of a component's scene."""
     plans = [sight.views[component.scene].op.plans[0] for sight in looking.sights]
-    widths = [p.psfs[1].fwhm_px.min() * abs(np.linalg.det(p.mapping.matrix)) ** 0.5 for p in plans]
-    return np.array(widths) / SIGMAS_A_FWHM
+    scale = np.sqrt([abs(np.linalg.det(plan.mapping.matrix)) for plan in plans])
+    of = np.max if widest else np.min
+    return scale * [of(plan.psfs[1].fwhm_px) for plan in plans] / SIGMAS_A_FWHM
 
 
 def _wider(looking, component, theta):
@@ -114,7 +115,8 @@ def _wider(looking, component, theta):
 
 
 def _narrower(looking, component, theta):
-    """Those of one that is narrower, if all observations resolve it."""
+    """Those of one that is narrower, if all of several bands resolve it."""
     core = theta[0] - np.log(GROWTH)
-    resolved = np.exp(core) > _psf_sigmas(looking, component).max()
-    return [np.array([core, *theta[1:3], component.shape.mean[3]])] if resolved else []
+    resolved = np.exp(core) > _psf_sigmas(looking, component, widest=True).max()
+    found = [np.array([core, *theta[1:3], component.shape.mean[3]])]
+    return found if resolved and n_bands(looking) > 1 else []
