@@ -8,7 +8,7 @@ from clresample import Settings
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
-from clresample.deblending.start import population
+from clresample.deblending.start import population, profile_fit
 from clresample.deblending.start.population import (
     GALAXY_SCATTER,
     LEARNED,
@@ -22,7 +22,7 @@ from clresample.deblending.start.population import (
     em_step,
 )
 from clresample.deblending.start.profile_fit import ProfileFit
-from clresample.deblending.start.without_doubt import run_without_doubt
+from clresample.deblending.start.without_doubt import MIN_BRIGHT, _is_faint, run_without_doubt
 
 
 def shrunk(data, noise, mean, scatter):
@@ -285,3 +285,15 @@ def test_two_bright_galaxies_that_are_alike_have_their_own_shapes(device, monkey
     start_fits([one])
     wanted = (np.log(6.0), 0.2, -0.1)
     np.testing.assert_allclose([theta[:3] for theta in one.start.thetas], [wanted] * 2, atol=0.02)
+
+
+def test_shapes_of_galaxies_far_fainter_than_those_they_overlap_stay_doubted(device, monkeypatch):
+    bright = ((26, 24), (30000, 25000, 21000), 4.0)
+    others = ((34, 30), 0.01), ((18, 30), 0.2), ((50, 50), 0.01)  # the last one is far away
+    faint = [(place, tuple(part * f for f in bright[1]), 3.0) for place, part in others]
+    seen = []
+    monkeypatch.setattr(profile_fit, "run_without_doubt", lambda fit, scenes: seen.append(fit))
+    given = blend((bright, *faint), shape=(64, 64), seed=6)
+    start_fits([Fit(given, Settings(), device, np.float32, pad=1)])
+    assert 0.01 < MIN_BRIGHT < 0.2
+    assert _is_faint(seen[0], np.arange(1)).tolist() == [[False, True, False, False]]
