@@ -26,8 +26,8 @@ MIN_ALIKE, MAX_ASIDE = 0.003, 0.3
 # of its flux, and one of 49 the rest; with 0.2, disks between two galaxies stay round.
 MIN_BRIGHT = 0.05
 # Smallest gain in chi2 of the best end, beside what errors of the neighbours' models may feign.
-# With half of it, and the largest E^2 in place of the sum, two of 88 scenes of COSMOS galaxies lose
-# 3 to 7 dB in several of them.
+# With half of it, the largest E^2 in place of the sum, and all shapes freed, two of 88 scenes of
+# COSMOS galaxies lose 3 to 7 dB in several of them.
 MIN_BETTER = 4 * NEED
 
 
