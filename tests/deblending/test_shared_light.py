@@ -166,6 +166,6 @@ def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypat
     doubt = np.linalg.norm(seen[0], axis=(1, 2))
     assert 0.2 * flux[1] < doubt[1] < 1.01 * MAX_DOUBT * flux[1]
     assert doubt[2] < 0.02 * flux[2]  # other ends of the scene move it a little
-    assert doubt[4] < 0.05 * flux[4]  # in the light of a star
+    assert doubt[4] < 0.02 * flux[4]
     variance = np.diagonal(result.errors.flux, axis1=1, axis2=2)
     assert (variance >= np.square(seen[0]).sum(axis=2).T).all()

@@ -41,11 +41,13 @@ class Alternatives:
         counts = [len(some) for some in own.values()]
         self.component = np.repeat(list(own), counts)
         self.owner = np.repeat(np.arange(len(own)), counts)
-        self.first = np.flatnonzero(np.diff(self.component, prepend=-1))
+        self._is_first = np.diff(self.component, prepend=-1) != 0
+        self.first = np.flatnonzero(self._is_first)
         self.theta = [theta for some in own.values() for theta in some]
-        self.listed = [instead.get(i, looking.components[i]) for i in self.component]
-        for k in self.first:
-            self.listed[k] = looking.components[self.component[k]]
+        self.listed = [
+            looking.components[i] if present else instead.get(i, looking.components[i])
+            for i, present in zip(self.component, self._is_first, strict=True)
+        ]
         stars, spectra = fit.population.stars[fit.at][:, None], looking.spectra
         parts = [_residuals(looking, part) for part in (0 * spectra, spectra * stars, spectra)]
         peaks = peaks_of(self.listed, self.theta)
@@ -72,7 +74,7 @@ class Alternatives:
     def _products_of_own(self, spectra):
         """Products (n, C) of profiles with themselves and with the present models of the same."""
         alone, explained = np.zeros((2, len(self.owner), self.around.n_channels))
-        is_first = np.isin(np.arange(len(self.owner)), self.first)
+        is_first = self._is_first
         for sight, (table, _) in zip(
             self.around.sights, self.around.overlapping_pairs, strict=True
         ):
@@ -81,9 +83,8 @@ class Alternatives:
             use &= (one == other) | is_first[one] | is_first[other]
             gram = sight.gram(self.around.device.put(table[use].astype(np.int32)), 1)[..., 0, 0]
             a, b = np.where(is_first[other], (one, other), (other, one))[:, use]
-            same = one[use] == other[use]
-            alone[one[use][same], sight.channels] = gram[same]
-            seen = is_first[b]
+            same, seen = a == b, is_first[b]
+            alone[a[same], sight.channels] = gram[same]
             explained[a[seen], sight.channels] = (
                 spectra[self.component[b[seen]]][:, sight.channels] * gram[seen]
             )

@@ -177,9 +177,9 @@ def products_beside(looking, models, listed, error):
 def apart(around, listed, gain, at):
     """Selects the components of the largest gain (n,) at these places, with disjoint boxes.
 
-    listed (n): components, the first of `around`; at: the places among them that compete
+    listed (n): components; at: the places among them that compete
     """
-    low, high = np.zeros((2, len(around.components), 2))
+    low, high = np.zeros((2, len(listed), 2))
     slots = around.slots
     low[around.at], high[around.at] = slots.origin, slots.origin + slots.pixel[:, None] * slots.size
     taken: list[int] = []

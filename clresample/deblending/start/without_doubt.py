@@ -79,10 +79,10 @@ def _merge_galaxies(fit, b):
 
     The others begin as expected.
     """
-    looking, own = fit.looking, np.flatnonzero((fit.looking.scene == b) & _galaxies(fit))
-    index, place = looking.index[own], _places(looking, own)
-    theta, away = fit.theta[b, index], place - place[:, None]
-    light = (looking.spectra[own] / fit.noise[b]).sum(axis=1) * _overlap(fit, own, away)[0]
+    own, away, overlap, _ = _overlaps(fit, b)
+    index = fit.looking.index[own]
+    theta = fit.theta[b, index]
+    light = (fit.looking.spectra[own] / fit.noise[b]).sum(axis=1) * overlap
     beside = (light > 0) & (fit.source[b, index][:, None] != fit.source[b, index])
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-300)  # (n, n)
     aside = np.linalg.norm(np.einsum("ij,ijk->ik", light, away), axis=1)
@@ -107,33 +107,28 @@ def _galaxies(fit):
     return fit.expected.galaxies[fit.at]
 
 
-def _places(looking, components):
-    """Positions (n, 2) [px] of components."""
-    return np.array([looking.components[i].position for i in components]).reshape(-1, 2)
+def _overlaps(fit, b):
+    """Galaxies (n,) of scene b, their distances (n, n, 2) [px], and which may share light (n, n).
 
-
-def _overlap(fit, own, away):
-    """Selects pairs (n, n) of galaxies that may share light; also their signal to noise (n,).
-
-    As Gaussians of their second moments, under the model's PSF, in their best channels.
-
-    own (n,): components of one scene; away (n, n, 2) [px]: their distances
+    As Gaussians of their second moments, under the model's PSF. Last, their signal to noise (n,) in
+    their best channels.
     """
-    moments = np.array([fit.looking.components[i].shape.psf_moment for i in own])
-    c = covariance(fit.theta[fit.at][own], moments.reshape(-1, 2, 2))[0]
-    area, both = np.linalg.det(c) ** 0.25, c + c[:, None]
+    own = np.flatnonzero((fit.looking.scene == b) & _galaxies(fit))
+    components = [fit.looking.components[i] for i in own]
+    place = np.array([c.position for c in components]).reshape(-1, 2)
+    moments = np.array([c.shape.psf_moment for c in components]).reshape(-1, 2, 2)
+    c = covariance(fit.theta[fit.at][own], moments)[0]
+    away, area, both = place - place[:, None], np.linalg.det(c) ** 0.25, c + c[:, None]
     far = np.einsum("ijk,ijkl,ijl->ij", away, np.linalg.inv(both), away)
     alike = 2 * np.outer(area, area) / np.sqrt(np.linalg.det(both)) * np.exp(-far / 2)
-    return alike > MIN_ALIKE, fit.brightness[own] * np.sqrt(4 * np.pi) * area
+    return own, away, alike > MIN_ALIKE, fit.brightness[own] * np.sqrt(4 * np.pi) * area
 
 
 def _is_faint(fit, scenes):
     """Selects galaxies (k, n) of scenes (k,) that are far fainter than one they overlap."""
     found = np.zeros((len(scenes), fit.theta.shape[1]), bool)
     for row, b in zip(found, scenes, strict=True):
-        own = np.flatnonzero((fit.looking.scene == b) & _galaxies(fit))
-        place = _places(fit.looking, own)
-        overlap, snr = _overlap(fit, own, place - place[:, None])
+        own, _, overlap, snr = _overlaps(fit, b)
         row[fit.looking.index[own]] = snr < MIN_BRIGHT * np.where(overlap, snr, 0).max(1, initial=0)
     return found
 
