@@ -61,7 +61,7 @@ def run_from_equal_profiles(fit, scenes):
     fit._take(again, doubt=False)
     fit._step(again)
     better = fit.chi2_as_expected(scenes) < chi2
-    fit._undo(before, np.intersect1d(again, scenes[~better]))
+    fit._restore(before, np.intersect1d(again, scenes[~better]))
 
 
 def _best_ends(fit, rest, groups, windows, doubt):

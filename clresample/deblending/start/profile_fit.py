@@ -51,6 +51,7 @@ class ProfileFit:
     chi2_at_end (B,): as if the prior were the first one, before the sizes of grids
     brightness (N,): of components, see `thresholds`; is_known (B,): scenes with an earlier fit
     begun (B, n, 4): the expected parameters, or those of an earlier fit where they are larger
+    contamination (B, n): of the shapes at these steps; that of the population is what counts
     flux_estimate (N, 3, C): of faint galaxies' spectra the change to their mean, the scatter that
         is common to all channels, and that of each band, see shape_grid.py; 0 for others
     flux_doubt (N, C, k): changes of fluxes, see without_doubt.py and close_pairs.py
@@ -73,6 +74,7 @@ class ProfileFit:
         self.flux_doubt = np.zeros((*looking.spectra.shape, 0))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = [np.zeros(0)] * size[0]
+        self.contamination = np.ones(size[:2])
         self.is_known, self.begun = np.zeros(size[0], bool), self.expected.mean
         self.moves = np.ones(size[:2], bool)
 
@@ -102,25 +104,21 @@ class ProfileFit:
         fit_faint_shapes(self, some)
 
     def _copy(self):
-        """Copies of chi2, theta, the solution and the prior."""
+        """Copies of chi2, theta, the equations, the solution and the prior."""
         kept = self.looking.kept_solution(), deepcopy(self.population)
-        return self.chi2.copy(), self.theta.copy(), *kept
+        equations = list(self.normal), self.right.copy(), self.contamination.copy()
+        return self.chi2.copy(), self.theta.copy(), equations, *kept
 
     def _restore(self, before, scenes):
         """Restores some scenes (k,) from a `_copy`."""
-        chi2, theta, solution, population = before
+        chi2, theta, (normal, right, contamination), solution, population = before
         self.chi2[scenes], self.theta[scenes] = chi2[scenes], theta[scenes]
+        self.right[scenes], self.contamination[scenes] = right[scenes], contamination[scenes]
+        for b in scenes:
+            self.normal[b] = normal[b]
         self.looking.restore(solution, scenes)
         self.population.reset(scenes, population)
         self._measure_brightness(self.theta)
-
-    def _undo(self, before, scenes):
-        """Restores some scenes (k,) from a `_copy`, with their equations."""
-        self._restore(before, scenes)
-        if len(scenes):
-            self._look(scenes, self.theta, slopes=True)
-            self.looking.compute_residuals(MODEL_ERROR)
-            self._take_equations(scenes)
 
     def part(self, looking, chosen, noise):
         """ProfileFit of components (k,), those of `looking`, with the noise of its scenes."""
@@ -136,10 +134,10 @@ class ProfileFit:
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
-            if doubt:
-                self.update_contamination(scenes)
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
+            if doubt:
+                self.doubt(scenes, self.contamination[scenes])
 
     def _step(self, scenes, n_steps=N_STEPS, tol=None, *, learn=False, until_grown=False):
         """Step until some scenes have ended; tol: least gain, measured or expected; None: self.tol.
@@ -171,7 +169,8 @@ class ProfileFit:
             if len(some) and i_step < n_steps - 1:
                 learning[some] = self._learn(some) <= gain[np.searchsorted(scenes, some)]
         if learn:
-            self._take(np.flatnonzero(~learning))
+            scenes = np.flatnonzero(~learning)
+            self.doubt(scenes, self.contamination[scenes])
 
     def _try(self, scenes, trial):
         """Tries parameters (k, n, 4) of each of the scenes; the gains (k,).
@@ -212,22 +211,29 @@ class ProfileFit:
         """Updates the prior of some scenes from the present parameters; increase (k,) of chi2."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.own_equations(scenes))
-        self.update_contamination(scenes)
+        increase = self.population.penalty(scenes, self.theta) - before
+        self.chi2[scenes] += increase
+        return increase + self.doubt(scenes, self.contamination[scenes])
+
+    def doubt(self, scenes, contamination):
+        """Stores the contamination (k, n) that counts in some scenes; increase (k,) of chi2."""
+        before = self.population.penalty(scenes, self.theta)
+        self.population.set_contamination(scenes, contamination)
         increase = self.population.penalty(scenes, self.theta) - before
         self.chi2[scenes] += increase
         return increase
 
-    def update_contamination(self, scenes):
-        """Stores and returns the contamination (k, n) of some of the scenes solved last."""
+    def measure_contamination(self, scenes):
+        """The `contamination_factors` (k, n) of some of the scenes solved last."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
         prior = (a[scenes] for a in (self.source, self.population.stars, self.population.own_light))
-        self.population.set_contamination(scenes, contamination_factors(normal, spectra, *prior))
-        return self.population.contamination[scenes]
+        return contamination_factors(normal, spectra, *prior)
 
     def _take_equations(self, scenes):
-        """Stores the normal equations of some of the scenes rendered last."""
+        """Stores the normal equations and contamination of some of the scenes solved last."""
+        self.contamination[scenes] = self.measure_contamination(scenes)
         for b in scenes:
             self.normal[b] = np.zeros(0)  # before there are others
         normal, right = normal_equations(self.looking)

@@ -224,7 +224,7 @@ def _with_second_components(patches, fit, points):
     if not found:
         return {}
     scenes, inputs = np.unique(fit.looking.scene[list(found)]), {}
-    feigned = (fit.update_contamination(scenes) > NEED) & (growth(fit)[scenes] > MAX_GROWTH)
+    feigned = (fit.measure_contamination(scenes) > NEED) & (growth(fit)[scenes] > MAX_GROWTH)
     for b, anew in zip(scenes.tolist(), feigned, strict=True):
         begin, sources = points[b], list(patches[b].sources)
         thetas: list = [[] for _ in sources]

@@ -44,10 +44,10 @@ def run_without_doubt(fit, scenes):
         return
     contamination = fit.population.contamination[scenes]
     doubted = np.where(_is_faint(fit, scenes), contamination, 1)
-    fit.population.contamination[scenes] = doubted
+    fit.doubt(scenes, doubted)
     given = *fit._equations(scenes), fit.population.galaxies[scenes]
     may_gain = StepControl(len(fit.theta)).next(scenes, *given)[1] > MIN_GAIN
-    fit.population.contamination[scenes] = contamination
+    fit.doubt(scenes, contamination)
     if not may_gain.any():
         return
     scenes, doubted = scenes[may_gain], doubted[may_gain]
@@ -57,15 +57,16 @@ def run_without_doubt(fit, scenes):
     for merged in (False, True):
         fit._restore(before, scenes)
         some = np.array([not merged or _merge_galaxies(fit, b) for b in scenes])
-        fit.population.contamination[scenes] = doubted
-        fit._take(scenes[some], doubt=False)
+        fit.doubt(scenes, doubted)
+        if merged:
+            fit._take(scenes[some], doubt=False)
         fit._step(scenes[some])
         chi2 = np.where(some, fit.chi2_as_expected(scenes), np.inf)
         ends.append((chi2, _fluxes(fit)))
-        fit._undo(best, scenes[chi2 >= lowest])
+        fit._restore(best, scenes[chi2 >= lowest])
         best, lowest = fit._copy(), np.minimum(chi2, lowest)
     stays = here - lowest > MIN_BETTER + feigned
-    fit._undo(before, scenes[~stays])
+    fit._restore(before, scenes[~stays])
     flux, kept, weight = _fluxes(fit), np.where(stays, lowest, here), np.zeros(len(fit.theta))
     doubt = np.zeros((*flux.shape, len(ends)))
     for k, (chi2, other) in enumerate(ends):
