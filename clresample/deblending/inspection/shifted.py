@@ -11,7 +11,11 @@ from .disagreement import ImagePlane, shifts_at
 # [model px] Smallest shift that counts: world coordinates of good surveys agree to about this, and
 # smaller shifts change fluxes by less than the PSF's errors.
 MIN_SHIFT_PX = 0.25
-# [px] The same between channels of one observation.
+# Largest error of a shift that counts, in pixels of the observation, and at least MIN_SHIFT_PX:
+# larger ones are of one doubtful source. With MIN_SHIFT_PX alone no shift of an image with pixels
+# of 0.6" beside one of 0.05" counted below a signal to noise of some 300.
+MAX_SHIFT_ERROR_PX = 0.1
+# [px] Smallest shift that counts between channels of one observation.
 MIN_CHANNEL_PX = 0.15
 # [sigma] Significance of a shift between observations, and between channels; the latter are many
 # more, and colour differences inside a galaxy look like shifts.
@@ -45,7 +49,7 @@ def disagreements(images, found, fit_shifts):
         if i == first:
             continue
         shift, error = _between(images[first], found[first], image, found[i])
-        if significant(shift, error):
+        if significant(shift, error, most=_largest_error(image)):
             shifts[i], errors[i] = shift, error
         elif not error.max() < MIN_SHIFT_PX:
             shifts[i] = np.nan  # not measured
@@ -67,13 +71,19 @@ def disagreements(images, found, fit_shifts):
     return (moved - moved[0] if fit_shifts and moved.any() else None), lines
 
 
-def significant(shift, error, least=MIN_SHIFT_PX, sigmas=SHIFT_SIGMAS):
+def significant(shift, error, least=MIN_SHIFT_PX, sigmas=SHIFT_SIGMAS, most=0.0):
     """Returns True if a shift (2,) with errors (2,) exceeds `least`, and `sigmas` of its errors.
 
-    Errors larger than `least` come from one doubtful source: such a shift is not significant.
+    Errors larger than `least` and `most` come from one doubtful source: such a shift is not
+    significant.
     """
-    known = error.max() < least
+    known = error.max() < max(least, most)
     return known and np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
+
+
+def _largest_error(image):
+    """Largest error [model px] of a shift of an image that counts."""
+    return MAX_SHIFT_ERROR_PX / np.sqrt(abs(np.linalg.det(image.matrix)))
 
 
 def sharpest(images) -> int:
@@ -113,7 +123,7 @@ def _closer(one, other):
         shifts, errors = np.concatenate([shifts, found[0]]), np.concatenate([errors, found[1]])
         shift, error = common(shifts @ inverse.T, errors * scale)
         error = error * np.sqrt(n)  # errors of a source are common to all channels
-        if not significant(shift, error, sigmas=MAYBE_SIGMAS):
+        if not significant(shift, error, sigmas=MAYBE_SIGMAS, most=_largest_error(other)):
             break
     return shift, error
 
