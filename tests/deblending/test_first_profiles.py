@@ -120,7 +120,7 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
     """The first start comes back with its doubt: chi2 is then that of the state solved anew."""
     measured = []
 
-    def noted(fit, scenes):
+    def noted(fit, _scenes, scenes):
         kept = fit.chi2[scenes].copy()
         fit._take(scenes)
         measured.append((kept, fit.chi2[scenes]))
@@ -132,8 +132,8 @@ def test_two_fits_are_compared_under_the_same_doubt(sized, monkeypatch):
     np.testing.assert_allclose(kept, again, rtol=1e-5)
 
 
-def test_a_first_start_that_wins_goes_on_with_less_doubt(sized, monkeypatch):
-    """To where no step gains anything: its doubt had held both galaxies of a pair too small."""
+def test_a_first_start_that_wins_goes_on(sized, monkeypatch):
+    """To where no step gains anything."""
     further = []
 
     def noted(fit, scenes):

@@ -7,16 +7,22 @@ from helpers.scenes import blend, frame, observe, sources
 from clresample import Settings
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
-from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
+from clresample.deblending.profiles import (
+    ELLIPTICITY_SCATTER,
+    FixedProfile,
+    GalaxyProfile,
+    StarProfile,
+)
 from clresample.deblending.start import population, profile_fit
 from clresample.deblending.start.population import (
+    ANY_SHAPE,
     GALAXY_SCATTER,
     LEARNED,
     NEIGHBOUR_MODEL_ERROR,
     OWN_LIGHT,
     SCENE_SCATTER,
     STAR_MODEL_ERROR,
-    TAILS,
+    STUDENT_DOF,
     PopulationPrior,
     contamination_factors,
     em_step,
@@ -126,7 +132,9 @@ def test_only_whole_galaxies_of_scenes_with_several_are_learned_from():
     # galaxies' parameters have Student's tails, a star's place has none
     away, smooth = 0.25 / scatter**2, np.zeros(mean.shape[:2], bool)
     smooth[0, [0, 2]] = smooth[1, 0] = smooth[2, :3] = True
-    tails = np.where(smooth[..., None], TAILS * np.log1p(away / TAILS), away)
+    tails = np.where(smooth[..., None], STUDENT_DOF * np.log1p(away / STUDENT_DOF), away)
+    tails[smooth, 1] = -2 * np.log(density(0.5**0.5) / density(0.0))
+    tails[smooth, 2] = 0
     np.testing.assert_allclose(before, tails[[2, 0]].sum(axis=(1, 2)))
     one.update(np.arange(3), theta, np.tile(1e4 * np.eye(4), (3, 4, 1, 1)))
     changed = np.zeros(mean.shape, bool)
@@ -155,7 +163,7 @@ def test_a_faint_galaxy_is_taken_for_what_its_neighbours_are(device):
     assert large[0] - small[0] > 0.15
 
 
-def test_shapes_are_doubted_for_the_light_of_other_sources():
+def test_shapes_are_doubted_for_the_light_of_other_sources(monkeypatch):
     """By what a neighbour's light counts in units of the noise, seen as the galaxy sees its own.
 
     In the channels that tell most.
@@ -172,7 +180,7 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     for i in range(3):
         others = seen.sum(1) - seen[:, i]
         own, beside = (seen[:, i] ** 2).sum(axis=1), (seen * seen[:, i, None]).sum(axis=(0, 2))
-        alike = np.minimum(1, np.sqrt(own.sum() / (seen**2).sum(axis=(0, 2))))
+        alike = np.minimum(1, own.sum() / (seen**2).sum(axis=(0, 2)))
         beside[i] = 0
         held = OWN_LIGHT * (beside @ alike) / beside.sum()
         for some in ([0], [1], [0, 1]):  # channels
@@ -191,12 +199,34 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     # a star beside them counts by the error of a PSF
     only = np.array([[1.0, 0, 1]])
     stars[0, 2], less = True, STAR_MODEL_ERROR / NEIGHBOUR_MODEL_ERROR
-    pair = contamination_factors(
-        np.abs(normal), light[None] * only, source, np.zeros_like(stars), 0.0
-    )
-    beside = contamination_factors(np.abs(normal), light[None] * only, source, stars, 0.0)
+    monkeypatch.setattr(population, "OWN_LIGHT", 0.0)
+    pair = contamination_factors(np.abs(normal), light[None] * only, source, np.zeros_like(stars))
+    beside = contamination_factors(np.abs(normal), light[None] * only, source, stars)
     np.testing.assert_allclose(beside[0, 0] - 1, less**2 * (pair[0, 0] - 1))
     assert beside[0, 2] == pair[0, 2]
+
+
+def density(g):
+    """Of a galaxy's ellipticity at |g|: round within a scatter, or any e of |e| < 1."""
+    near = np.exp(-(g**2) / 2 / ELLIPTICITY_SCATTER**2) / (2 * np.pi * ELLIPTICITY_SCATTER**2)
+    return (1 - ANY_SHAPE) * near + ANY_SHAPE / (np.pi * (1 + g**2) ** 2)
+
+
+def test_flat_galaxies_are_rare_and_not_impossible():
+    """The prior is a density, its precision the slope of the penalty, and it ends below 25."""
+    g = np.geomspace(1e-4, 1e4, 20000)
+    assert np.trapezoid(2 * np.pi * g * density(g), g) == pytest.approx(1, abs=1e-3)
+    one, scenes = PopulationPrior([GalaxyProfile(frame())], [0], [0], 1, 1, 4), np.arange(1)
+
+    def penalty(g):
+        return one.penalty(scenes, one.mean + [0, 0.6 * g, 0.8 * g, 0])[0]
+
+    for g in (0.1, 0.5, 1.0, 2.4):
+        found = one.precision(scenes, one.mean + [0, 0.6 * g, 0.8 * g, 0])[0, 0, 1:3]
+        slope = (penalty(g + 1e-6) - penalty(g - 1e-6)) / 2e-6
+        np.testing.assert_allclose(found, np.full(2, slope / (2 * g)), rtol=1e-5)
+    assert penalty(0.3) == pytest.approx((0.3 / ELLIPTICITY_SCATTER) ** 2, rel=0.1)
+    assert penalty(0.5) < penalty(2.4) < 25
 
 
 def test_doubt_holds_a_galaxy_as_if_its_data_said_less():
@@ -249,10 +279,10 @@ def test_shapes_are_doubted_in_a_group_as_alone(device):
 
 
 def test_a_faint_galaxy_takes_less_of_what_is_wrong_with_a_bright_one(device, monkeypatch):
-    """A bright galaxy with an arm of 1 % of its light is no smooth profile; the faint one beside it
-    is round, and drawn out along the arm less far where its shape is doubted."""
+    """A bright galaxy with an arm of 0.5 % of its light is no smooth profile; the faint one beside
+    it is round, and drawn out along the arm less far where its shape is doubted."""
     bright, faint = ((30, 24), (6e4, 5e4, 7e4), 3.6), ((30, 34), (300, 240, 270), 2.0)
-    arm = [((30 - 2 * k, 31 + k), (150, 135, 165), 1.5) for k in range(5)]
+    arm = [((30 - 2 * k, 31 + k), (60, 54, 66), 1.5) for k in range(5)]
     seen = observe((bright, faint, *arm), shape=(60, 60), seed=5)
     shapes = []
     for wrong in (0.0, NEIGHBOUR_MODEL_ERROR):
@@ -277,7 +307,7 @@ def test_two_bright_galaxies_that_are_alike_have_their_own_shapes(device, monkey
         fit.theta[0, 1] = np.log(1.5), 0, 0, np.log(6.5)
         fit._take(np.arange(1))
         assert fit.population.contamination[0, 1] > 10
-        run_without_doubt(fit, np.arange(1))
+        run_without_doubt(fit, np.arange(1), np.arange(1))
 
     if spoilt:
         monkeypatch.setattr(ProfileFit, "run", run)
@@ -292,7 +322,7 @@ def test_shapes_of_galaxies_far_fainter_than_those_they_overlap_stay_doubted(dev
     others = ((34, 30), 0.01), ((18, 30), 0.2), ((50, 50), 0.01)  # the last one is far away
     faint = [(place, tuple(part * f for f in bright[1]), 3.0) for place, part in others]
     seen = []
-    monkeypatch.setattr(profile_fit, "run_without_doubt", lambda fit, scenes: seen.append(fit))
+    monkeypatch.setattr(profile_fit, "run_without_doubt", lambda fit, *_: seen.append(fit))
     given = blend((bright, *faint), shape=(64, 64), seed=6)
     start_fits([Fit(given, Settings(), device, np.float32, pad=1)])
     assert 0.01 < MIN_BRIGHT < 0.2

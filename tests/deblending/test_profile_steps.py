@@ -8,7 +8,6 @@ import pytest
 from clresample.deblending.linear.linearised_scenes import LinearisedScenes
 from clresample.deblending.settings import Settings
 from clresample.deblending.start import profile_fit
-from clresample.deblending.start.population import OWN_LIGHT
 from clresample.deblending.start.profile_fit import ProfileFit
 from clresample.paper.settings import PaperSettings
 
@@ -73,6 +72,7 @@ def valley(monkeypatch):
 
         monkeypatch.setattr(profile_fit, "normal_equations", equations)
         monkeypatch.setattr(profile_fit, "peaks_of", lambda c, thetas: np.ones(len(c)))
+        monkeypatch.setattr(profile_fit, "run_without_doubt", lambda *_: None)
         fit = ProfileFit(looking, np.ones((len(goals), 1)))
         fit.begin()
         return fit, looking
@@ -117,7 +117,7 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
 
 @pytest.mark.parametrize(("n_pixels", "again"), [(np.inf, [1, 2, 4]), (10, [1, 2, 4, 5])])
 def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pixels, again):
-    """In fewer trials, with the doubt of large galaxies from the first on.
+    """In fewer trials.
 
     Second starts are of scenes whose galaxies grow beyond their earlier and their expected size,
     and of unexplained ones without an earlier fit.
@@ -138,25 +138,24 @@ def test_scenes_with_known_parameters_go_on_from_there(valley, monkeypatch, n_pi
     np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
     n_trials = looking.n_looks - before
     assert n_trials[0] < n_trials[1] and begun == again
-    assert fit.population.own_light[:, 0].tolist() == [OWN_LIGHT, 0, OWN_LIGHT, 0, 0, 0]
     assert fit.is_known.tolist() == [True, False, True, True, False, False]
 
 
 def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatch):
     """Of that scene alone, whose doubt is made anew at the end."""
     fit, looking = valley([4.0, 4.0])
-    learnt, taken = [], []
+    learnt, doubted = [], []
 
     def learn(scenes):
         learnt.append(scenes.tolist())
         return np.where(scenes == 0, 1e6, -1.0)
 
     monkeypatch.setattr(fit, "_learn", learn)
-    monkeypatch.setattr(fit, "_take", lambda scenes: taken.append(scenes.tolist()))
+    monkeypatch.setattr(fit, "doubt", lambda scenes, _: doubted.append(scenes.tolist()))
     fit.run()
     assert learnt[0] == [0, 1] and len(learnt) > 2
     assert all(scenes == [1] for scenes in learnt[1:])
-    assert taken == [[0]]
+    assert doubted == [[0]]
     np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)
 
 

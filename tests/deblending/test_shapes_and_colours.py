@@ -61,16 +61,17 @@ def row(flux, device):
     return (found - want) / error, (found / want)[:, 1]
 
 
-@pytest.mark.parametrize("flux", [800.0, 8000.0])
-def test_a_disk_between_two_galaxies_on_its_axis_keeps_its_light(device, flux):
+@pytest.mark.parametrize(("flux", "part"), [(800.0, 0.9), (8000.0, 0.9), (32000.0, 0.5)])
+def test_a_disk_between_two_galaxies_on_its_axis_keeps_its_light(device, flux, part):
+    """Or its errors hold what these may have of it."""
     pull, ratio = row(flux, device)
-    assert (np.abs(pull) < 3).all() and (ratio > 0.9).all()
+    assert (np.abs(pull) < 3).all() and (ratio > part).all()
 
 
-def test_if_the_doubt_of_its_shape_stayed_its_neighbours_would_have_it(device, monkeypatch):
+def test_without_another_start_its_neighbours_would_have_it(device, monkeypatch):
     monkeypatch.setattr(profile_fit, "run_without_doubt", lambda *_: None)
-    pull, ratio = row(800.0, device)
-    assert (ratio < 0.75).all() and (pull[:, 1] < -4).all()
+    pull, ratio = row(32000.0, device)
+    assert (ratio < 0.75).all() and pull[0, 1] < -4
 
 
 def bulge_and_disk(seed, device, gradient=True):

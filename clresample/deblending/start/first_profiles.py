@@ -22,7 +22,7 @@ import numpy as np
 from ..linear.component_batch import renumbered
 from ..linear.spectra import MODEL_ERROR
 from ..profiles import GalaxyProfile
-from .population import NEIGHBOUR_MODEL_ERROR, OWN_LIGHT
+from .population import NEIGHBOUR_MODEL_ERROR
 
 # Ratio of successive sizes: least squares converge from half of it.
 GROWTH = 3.0
@@ -76,7 +76,6 @@ def begin_with_large_galaxies(fit, scenes):
     """Sets the parameters of scenes (k,) of a ProfileFit anew; which have large galaxies (k,)."""
     fit.theta[scenes] = fit.expected.mean[scenes]
     fit.population.reset(scenes, fit.expected)
-    fit.population.own_light[scenes] = OWN_LIGHT
     fit.solve_shapes(scenes)
     return first_profiles(fit, scenes, MODEL_ERROR)[scenes].any(axis=1)
 

@@ -12,7 +12,7 @@ from ..linear.linearised_scenes import LinearisedScenes
 from ..linear.spectra import MODEL_ERROR, add_diagonal
 from .close_pairs import run_from_equal_profiles
 from .first_profiles import begin_with_large_galaxies
-from .population import OWN_LIGHT, PopulationPrior, contamination_factors
+from .population import PopulationPrior, contamination_factors
 from .shape_grid import fit_faint_shapes
 from .step_control import StepControl
 from .without_doubt import run_without_doubt
@@ -25,17 +25,14 @@ N_STEPS, CHI2_TOL = 40, 1.0
 MAX_SHORTFALL = 2.0
 # A scene may hold large galaxies if one became larger than expected by this in ln sigma, or if chi2
 # per pixel is above MAX_CHI2. Of 24 simulated scenes (seeds from 0) none of parametric galaxies is
-# beyond 0.74 and 1.06, but six of real COSMOS galaxies are, of which one has a second start. Second
-# starts that differed from first ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
-MAX_GROWTH, MAX_CHI2 = 0.8, 1.2
+# beyond 0.74 and 1.06, nor one of 300 galaxies beyond 0.8. Second starts that differed from first
+# ones were all of scenes beyond 1.1 (bench.ladder, seed 5).
+MAX_GROWTH, MAX_CHI2 = 1.0, 1.2
 # A first start ends, for one from large profiles, when a galaxy is larger than it began by this in
 # ln sigma. That start had the lower chi2 in all of 10 scenes with several galaxies beyond 1.2
 # (bench.ladder, seed 4401), at up to a fifth less time. With ln 3 more of the scenes that gain
 # nothing from it are started again (bench.throughput).
 GROWN = 1.5
-# Largest number of components of a scene of small galaxies that is fitted without doubt: ends are
-# compared for whole scenes, and that of 300 sources took a third of the start for nothing.
-MAX_FREED = 30
 
 
 class ProfileFit:
@@ -95,10 +92,7 @@ class ProfileFit:
         scenes = np.flatnonzero(_may_hold_large_galaxies(self))
         if len(scenes):
             _run_from_large_galaxies(self, scenes)
-        doubted = some[(self.population.contamination[some] > 1).any(axis=1)]
-        few = (self.source[doubted] >= 0).sum(axis=1) <= MAX_FREED
-        new = few & ~self.is_known[doubted]
-        run_without_doubt(self, doubted[new | np.isin(doubted, scenes)])
+        run_without_doubt(self, some, scenes)
         run_from_equal_profiles(self, some)
         self.chi2_at_end = self.chi2_as_expected(np.arange(len(self.theta)))
         fit_faint_shapes(self, some)
@@ -228,8 +222,8 @@ class ProfileFit:
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        prior = (a[scenes] for a in (self.source, self.population.stars, self.population.own_light))
-        return contamination_factors(normal, spectra, *prior)
+        given = self.source[scenes], self.population.stars[scenes]
+        return contamination_factors(normal, spectra, *given)
 
     def _take_equations(self, scenes):
         """Stores the normal equations and contamination of some of the scenes solved last."""
@@ -272,9 +266,7 @@ def start_from(fit, known):
     for i in galaxies:
         fit.theta[fit.looking.scene[i], fit.looking.index[i], : fit.counts[i]] = known[i]
     scenes = np.unique(fit.looking.scene[galaxies])
-    grown = growth(fit)[scenes].max(axis=1) > MAX_GROWTH
     fit.is_known[scenes], fit.begun = True, np.maximum(fit.theta, fit.begun)
-    fit.population.own_light[scenes[grown]] = OWN_LIGHT
     fit._take(scenes)
 
 
@@ -302,20 +294,19 @@ def _may_hold_large_galaxies(fit):
 def _run_from_large_galaxies(fit, scenes):
     """Fits scenes (k,) of a ProfileFit again from profiles of large galaxies.
 
-    The better fit of each stays. Scenes in which no larger profile has more of the light keep the
-    first one, which goes on with less doubt where it was ended because a galaxy had grown.
+    The better fit of each stays. The first one goes on where it was ended because a galaxy had
+    grown.
     """
     before, chi2 = fit._copy(), fit.chi2_as_expected(scenes)
     grown = _have_grown(fit)[scenes]
     some = begin_with_large_galaxies(fit, scenes)
-    _go_on_with_less_doubt(fit, scenes[some])
+    _go_on(fit, scenes[some])
     better = some & (fit.chi2_as_expected(scenes) < chi2)
     fit._restore(before, scenes[~better])
-    _go_on_with_less_doubt(fit, scenes[~better & (some | grown)])
+    _go_on(fit, scenes[~better & grown])
 
 
-def _go_on_with_less_doubt(fit, scenes):
-    """Steps of scenes (k,) of a ProfileFit from where they are, with OWN_LIGHT."""
-    fit.population.own_light[scenes] = OWN_LIGHT
+def _go_on(fit, scenes):
+    """Steps of scenes (k,) of a ProfileFit from where they are."""
     fit._take(scenes)
     fit._step(scenes, learn=True)

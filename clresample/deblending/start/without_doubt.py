@@ -1,9 +1,10 @@
 """Further starts without doubt of shapes, of scenes in which that doubt may hold one of them.
 
 If one of two similar galaxies has the other one's light, that one's shape is contaminated
-(population.py); so is a disk between two galaxies on its major axis, which then stays round while
-they have its ends. Such scenes are fitted again without doubt. Errors of fluxes hold the changes to
-the ends that do not stay, as those of close_pairs.py.
+(population.py), and the scene is fitted again without doubt. A disk between two galaxies on its
+major axis stays round while they have its ends: its scene is fitted again from where it has all of
+that light. Errors of fluxes hold the changes to the ends that do not stay, as those of
+close_pairs.py.
 """
 
 from __future__ import annotations
@@ -29,36 +30,48 @@ MIN_BRIGHT = 0.05
 # With half of it, the largest E^2 in place of the sum, and all shapes freed, two of 88 scenes of
 # COSMOS galaxies lose 3 to 7 dB in several of them.
 MIN_BETTER = 4 * NEED
+# Largest number of components of a scene of small galaxies that is fitted without doubt, and of any
+# that is fitted from merged ones: ends are compared for whole scenes, and that of 300 sources took
+# a third of the start for nothing.
+MAX_FREED = 30
 
 
-def run_without_doubt(fit, scenes):
-    """Fits scenes of a ProfileFit again without contamination of their shapes.
+def run_without_doubt(fit, scenes, large):
+    """Fits some of the scenes (k,) of a ProfileFit again without contamination of their shapes.
 
-    Scenes in which a step may gain MIN_GAIN are fitted from where they are, and from galaxies that
-    have the light of those about them. The best end stays if it gains MIN_BETTER and the sum of
-    E^2, as much as errors of the neighbours' models may feign (population.py): below that structure
-    decides. Shapes of scenes that stay are free until the start ends. Galaxies far fainter than
-    others stay doubted.
+    large: the numbers of those that may hold large galaxies
+
+    Scenes in which a step may gain MIN_GAIN are fitted from where they are, and those with galaxies
+    between others from where these have all the light. The best end stays if it gains MIN_BETTER
+    and the sum of E^2, as much as errors of the neighbours' models may feign (population.py): below
+    that structure decides. Shapes of scenes that stay are free until the start ends. Galaxies far
+    fainter than others stay doubted.
     """
+    few = (fit.source[scenes] >= 0).sum(axis=1) <= MAX_FREED
+    few, scenes = (a[(few & ~fit.is_known[scenes]) | np.isin(scenes, large)] for a in (few, scenes))
     if not len(scenes):
         return
     contamination = fit.population.contamination[scenes]
     doubted = np.where(_is_faint(fit, scenes), contamination, 1)
     fit.doubt(scenes, doubted)
     given = *fit._equations(scenes), fit.population.galaxies[scenes]
-    may_gain = StepControl(len(fit.theta)).next(scenes, *given)[1] > MIN_GAIN
+    frees = StepControl(len(fit.theta)).next(scenes, *given)[1] > MIN_GAIN
+    frees &= (contamination > doubted).any(axis=1)
     fit.doubt(scenes, contamination)
-    if not may_gain.any():
+    merged = {b: theta for b in scenes[few] if (theta := _merged(fit, b)) is not None}
+    merges = np.isin(scenes, list(merged))
+    given = scenes, frees, merges, doubted, (contamination - doubted).sum(axis=1)
+    scenes, frees, merges, doubted, feigned = (values[frees | merges] for values in given)
+    if not len(scenes):
         return
-    scenes, doubted = scenes[may_gain], doubted[may_gain]
-    feigned = (contamination[may_gain] - doubted).sum(axis=1)
     before, here = fit._copy(), fit.chi2_as_expected(scenes)
     ends, best, lowest = [(here, _fluxes(fit))], before, np.full(len(scenes), np.inf)
-    for merged in (False, True):
+    for some in (frees, merges):
         fit._restore(before, scenes)
-        some = np.array([not merged or _merge_galaxies(fit, b) for b in scenes])
         fit.doubt(scenes, doubted)
-        if merged:
+        if some is merges:
+            for b in scenes[some]:
+                fit.theta[b] = merged[b]
             fit._take(scenes[some], doubt=False)
         fit._step(scenes[some])
         chi2 = np.where(some, fit.chi2_as_expected(scenes), np.inf)
@@ -75,14 +88,14 @@ def run_without_doubt(fit, scenes):
     fit.flux_doubt = np.concatenate([fit.flux_doubt, doubt], axis=2)
 
 
-def _merge_galaxies(fit, b):
-    """Gives galaxies in the middle of others in scene b the light of these; False without any.
+def _merged(fit, b):
+    """Parameters (n, 4) of scene b, its galaxies between others with the light of these, or None.
 
     The others begin as expected.
     """
     own, away, overlap, _ = _overlaps(fit, b)
-    index = fit.looking.index[own]
-    theta = fit.theta[b, index]
+    index, found = fit.looking.index[own], fit.theta[b].copy()
+    theta = found[index]
     light = (fit.looking.spectra[own] / fit.noise[b]).sum(axis=1) * overlap
     beside = (light > 0) & (fit.source[b, index][:, None] != fit.source[b, index])
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-300)  # (n, n)
@@ -91,15 +104,16 @@ def _merge_galaxies(fit, b):
     moment = np.einsum("ij,ijkl->ikl", light, moment)
     size = np.trace(moment, axis1=1, axis2=2) / 2
     middle = (beside.sum(axis=1) > 1) & (aside < MAX_ASIDE * np.sqrt(size))
-    found = middle.any()
+    if not middle.any():
+        return None
     for i in np.flatnonzero(middle)[np.argsort(aside[middle])]:
         if not middle[i]:
             continue
         middle[beside[i]] = False
         (yy, xy), (_, xx) = moment[i]
         e = np.array([(yy - xx) / 2, xy]) / size[i]
-        fit.theta[b, index[beside[i]]] = fit.expected.mean[b, index[beside[i]]]
-        fit.theta[b, index[i], :3] = 0.5 * np.log(size[i]), *(e / np.sqrt(1 - min(e @ e, 0.9)))
+        found[index[beside[i]]] = fit.expected.mean[b, index[beside[i]]]
+        found[index[i], :3] = 0.5 * np.log(size[i]), *(e / np.sqrt(1 - min(e @ e, 0.9)))
     return found
 
 
