@@ -34,13 +34,13 @@ MIN_MOMENT = 0.64
 MIN_GALAXY_MOMENT = 0.25
 # Prior on a galaxy (start/population.py updates it from the scene's other galaxies): Gaussian sigma
 # 0.25" (half-light radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; round,
-# with a scatter of 0.17 per component; n of 0.52 to 0.85. Real galaxies are less round, 0.26
-# (Leauthaud et al. 2007). With that scatter models of faint galaxies follow the noise: median SDRs
-# of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to 0.3 dB lower in Euclid's or Rubin's
-# images alone. Without that smoothing they are equal. With WINGS of 25 and 60 mean SDRs of COSMOS
-# galaxies are 0.02 and 0.04 dB higher jointly, 0.1 and 0.15 dB in Rubin's images (40 scenes, seeds
-# from 83001), but stars at the middle of compact hosts have the light of these: one of signal to
-# noise 100 in a host of 100, n = 2.5, r_e = 0.4", 1.45 of its flux at 8 errors, and 1.22 at 2.6
+# with a scatter of 0.17 per component, or of any shape; n of 0.52 to 0.85. Real ones scatter by
+# 0.26 (Leauthaud et al. 2007). With that scatter models of faint galaxies follow the noise: median
+# SDRs of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to 0.3 dB lower in Euclid's or
+# Rubin's images alone. Without that smoothing they are equal. With WINGS of 25 and 60 mean SDRs of
+# COSMOS galaxies are 0.02 and 0.04 dB higher jointly, 0.1 and 0.15 dB in Rubin's images (40 scenes,
+# seeds from 83001), but stars at the middle of compact hosts have the light of these: one of signal
+# to noise 100 in a host of 100, n = 2.5, r_e = 0.4", 1.45 of its flux at 8 errors, and 1.22 at 2.6
 # with these. With 6 they are 0.06 dB lower.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.17

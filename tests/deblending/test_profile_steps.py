@@ -151,7 +151,7 @@ def test_learning_ends_where_it_takes_back_what_a_step_gained(valley, monkeypatc
         return np.where(scenes == 0, 1e6, -1.0)
 
     monkeypatch.setattr(fit, "_learn", learn)
-    monkeypatch.setattr(fit, "doubt", lambda scenes, _: doubted.append(scenes.tolist()))
+    monkeypatch.setattr(fit, "set_contamination", lambda scenes, _: doubted.append(scenes.tolist()))
     fit.run()
     assert learnt[0] == [0, 1] and len(learnt) > 2
     assert all(scenes == [1] for scenes in learnt[1:])

@@ -5,6 +5,7 @@ import pytest
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
+from clresample.deblending.inspection import shifted
 from clresample.deblending.inspection.centroids import common
 from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
@@ -185,3 +186,29 @@ def truth(b, device):
     )
     spectra = np.repeat(peaks[:, None], 3, axis=1)
     return scene, State(morphs, spectra, np.zeros(3))
+
+
+@pytest.mark.filterwarnings("ignore:light in wide:clresample.InputWarning")
+@pytest.mark.parametrize(("shift", "most", "named"), [(0.0, 0.1, 0), (0.2, 0.1, 1), (0.2, 0.0, 0)])
+def test_a_shift_counts_by_the_size_of_the_pixels(device, monkeypatch, shift, most, named):
+    """0.2" of an image with pixels of 0.6", known to 0.4 of those of 0.05"."""
+    monkeypatch.setattr(shifted, "MAX_SHIFT_ERROR_PX", most)
+    places = (-2.5, -2.0), (2.4, 2.2), (-2.2, 2.6), (2.6, -2.4)
+    rng, observations = np.random.default_rng(3), []
+    for name, n, scale, psf, flux in (
+        ("sharp", 180, 0.05, 0.06, 9000),
+        ("wide", 15, 0.6, 0.75, 160),
+    ):
+        off = shift if name == "wide" else 0.0
+        y, x = (np.indices((n, n)) - (n - 1) / 2) * scale
+        data, width = rng.normal(size=(n, n)), np.hypot(psf, 0.15)
+        for y0, x0 in places:
+            away = (y - y0 - off) ** 2 + (x - x0 + off) ** 2
+            peak = flux * scale**2 / (2 * np.pi * width**2)
+            data += peak * np.exp(-away / (2 * width**2))
+        seen, grid = PSF.gaussian(psf / scale, pixel=False, n_pixels=31), Grid.flat((n, n), scale)
+        observations.append(Observation(data, seen, grid, weights=1, name=name))
+    sources = [ExtendedSource(sky_deg=place) for place in places]
+    settings = Settings(max_iter=1, errors=False)
+    result = deblend(observations, sources, settings=settings, device=device)
+    assert sum("WCS disagree" in line for line in result.messages) == named

@@ -53,10 +53,12 @@ def disagreements(images, found, fit_shifts):
             shifts[i], errors[i] = shift, error
         elif not error.max() < MIN_SHIFT_PX:
             shifts[i] = np.nan  # not measured
-    apart = np.hypot(*(shifts[:, None] - shifts).transpose(2, 0, 1))
-    agreeing = (apart < MIN_SHIFT_PX).sum(axis=1) + 0.5 * (np.arange(len(images)) == first)
+    apart, largest = np.hypot(*(shifts[:, None] - shifts).transpose(2, 0, 1)), errors.max(axis=1)
+    least = np.maximum(MIN_SHIFT_PX, np.hypot(largest[:, None], largest))
+    agreeing = (apart < least).sum(axis=1) + 0.5 * (np.arange(len(images)) == first)
     right = int(agreeing.argmax())
-    moved = np.where(apart[right, :, None] >= MIN_SHIFT_PX, shifts[right] - shifts, 0.0)
+    away = apart[right, :, None] >= least[right, :, None]
+    moved = np.where(away, shifts[right] - shifts, 0.0)
     errors = np.hypot(errors, errors[right])
     name = images[right].observation.label
     cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"

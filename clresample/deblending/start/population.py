@@ -4,10 +4,14 @@ A galaxy's ln sigma and ln beta, its size and the width of its wings, follow
 
     theta_i = mean_i + c + s x_i,    c ~ N(0, SCENE_SCATTER^2),    x_i ~ Student's t of STUDENT_DOF
 
-with c and s common to the scene. Faint galaxies are then similar to the others of their scene. A
-galaxy unlike all others, a bright spiral among faint ones, has little weight. Both c and s are
-updated by a step of expectation and maximisation (Dempster, Laird & Rubin 1977, J. R. Stat. Soc. B
-39, 1) after each step of the fit. With
+with c and s common to the scene, and its ellipticity e = g / sqrt(1 + g^2), of variance v,
+
+    (1 - a) N(g; v) + a / (pi (1 + g^2)^2),    a = ANY_SHAPE,
+
+which is round, or any e of |e| < 1 with equal density. Faint galaxies are then similar to the
+others of their scene. A galaxy unlike all others, a bright spiral among faint ones, has little
+weight. Both c and s are updated by a step of expectation and maximisation (Dempster, Laird & Rubin
+1977, J. R. Stat. Soc. B 39, 1) after each step of the fit. With
 
     f_i = 1 / (1 + v_i / s^2),    v_i the variance of theta_i of the data alone,
 
@@ -27,8 +31,8 @@ The channels in which its neighbours have the least of its light may say more wi
 the least of (1 + E^2) |u|^2 / |u'|^2 counts, u' and E of the best of 1, 2, ... channels. A deep
 image of low resolution then does not hide what a sharp one shows of a galaxy.
 Light of stars in M counts by STAR_MODEL_ERROR. Of two galaxies that are alike each has its own
-light in the data, and neither shape is doubted: alike is |u|^2 / |M|^2, at most 1, in the mean of
-M's sources by their light in u.
+light in the data, and neither shape is doubted: alike is |u|^2 / |u_j|^2, at most 1, in the mean
+of the others u_j by their light in u.
 The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
 its neighbours' shapes unchanged. A faint galaxy beside a bright one then has the expected shape;
 the bright one's own data outweigh the prior. Stars have no shape, and their positions are fixed by
@@ -56,14 +60,13 @@ MIN_GALAXIES = 2
 MIN_INFORMATION = 0.01
 # Degrees of freedom. With 4, one galaxy three times as large as five others does not change the
 # prior of these; with a Gaussian their scatter would grow from 0.2 to 0.35. Fits of simulated
-# galaxies are equal with both.
+# galaxies are equal with both. A single galaxy's size and wings have the same tails before updates:
+# data can override the prior.
 STUDENT_DOF = 4.0
-# The same for the size and the wings of a single galaxy, before updates: data can override the
-# prior. Part of galaxies of any ellipticity e, with equal density: those expected round would pay
-# 200 in chi2 for an axis ratio of 0.2, 21 with this. Of 60 rows and crosses about a flat galaxy of
-# signal to noise 20 to 200 (Euclid and Rubin, and Rubin alone) 15 are silently wrong without it, 3
-# with it. Student's tails of 4 degrees of freedom in g cost 0.1 dB, this 0.02 dB (88 scenes, seeds
-# 84001, 85001).
+# Part of galaxies of any ellipticity: those expected round would pay 200 in chi2 for an axis ratio
+# of 0.2, 15 with this. Of 60 rows and crosses about a flat galaxy of signal to noise 20 to 200
+# (Euclid and Rubin, and Rubin alone) 14 are silently wrong without it, 4 with it. Student's tails
+# of 4 degrees of freedom in g cost 0.1 dB, this 0.02 dB (88 scenes, seeds 84001 and 85001).
 ANY_SHAPE = 0.3
 # Relative error of a neighbour's model, of one sign over a whole galaxy. With 0.1 the mean SDR of
 # simulated COSMOS galaxies is 0.1 dB above that without it; with 0.2 the gain is 0.13 dB (joint,
@@ -167,16 +170,18 @@ class PopulationPrior:
 def _pulls(away):
     """Terms (..., 4) of chi2 by squared distances (..., 4) of a galaxy's theta, and their slopes.
 
-    away: from the means, in scatters; the term of both parts of the ellipticity is the first one's
+    away: from the means, in scatters: those of the ellipticity are 0 and ELLIPTICITY_SCATTER, and
+        both its parts have one term, the first one's
     """
     terms, slopes = STUDENT_DOF * np.log1p(away / STUDENT_DOF), 1 / (1 + away / STUDENT_DOF)
     square, variance = away[..., 1] + away[..., 2], ELLIPTICITY_SCATTER**2
-    near, far = (1 - ANY_SHAPE) * np.exp(-square / 2), 1 + variance * square
-    part = 2 * variance * ANY_SHAPE  # at g = 0, in the density there of those expected round
-    some = part / far**2
-    terms[..., 1] = -2 * np.log((near + some) / (1 - ANY_SHAPE + part))
+    round_ones, far = (1 - ANY_SHAPE) * np.exp(-square / 2), 1 + variance * square
+    at_zero = 2 * variance * ANY_SHAPE  # both densities in that of round ones at g = 0
+    any_ones = at_zero / far**2
+    both = round_ones + any_ones
+    terms[..., 1] = -2 * np.log(both / (1 - ANY_SHAPE + at_zero))
     terms[..., 2] = 0
-    slopes[..., 1:3] = ((near + 4 * variance * some / far) / (near + some))[..., None]
+    slopes[..., 1:3] = ((round_ones + 4 * variance * any_ones / far) / both)[..., None]
     return terms, slopes
 
 

@@ -3,10 +3,9 @@
 Gauss-Newton on the shapes with the spectra eliminated (variable projection), over every channel of
 every instrument, so that a source detected by a single instrument starts correctly:
 
-    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum contamination ((theta - mean) / scatter)^2,
-    A >= 0
+    min  sum_pixels w (d - sum_s A_s R S_s)^2 - 2 sum contamination ln p(theta),    A >= 0
 
-The prior on theta, and the factor `contamination` for sources with neighbours, are in
+The prior p on theta, and the factor `contamination` for sources with neighbours, are in
 population.py. Residuals of smooth profiles are a tenth of a bright galaxy's light. The weights
 include them, 1/w = sigma^2 + (MODEL_ERROR * light)^2, so that profiles of faint neighbours are not
 fitted to its spiral arms. The light is that of the smoothed data, so that weights do not depend on

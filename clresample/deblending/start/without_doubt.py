@@ -1,9 +1,9 @@
-"""Further starts without doubt of shapes, of scenes in which that doubt may hold one of them.
+"""Further starts without doubt of shapes, where that doubt or neighbours may hold one of them.
 
 If one of two similar galaxies has the other one's light, that one's shape is contaminated
 (population.py), and the scene is fitted again without doubt. A disk between two galaxies on its
-major axis stays round while they have its ends: its scene is fitted again from where it has all of
-that light. Errors of fluxes hold the changes to the ends that do not stay, as those of
+major axis stays round while they have its ends: its scene is fitted again from where it has all
+light of the three. Errors of fluxes hold the changes to the ends that do not stay, as those of
 close_pairs.py.
 """
 
@@ -30,22 +30,23 @@ MIN_BRIGHT = 0.05
 # With half of it, the largest E^2 in place of the sum, and all shapes freed, two of 88 scenes of
 # COSMOS galaxies lose 3 to 7 dB in several of them.
 MIN_BETTER = 4 * NEED
-# Largest number of components of a scene of small galaxies that is fitted without doubt, and of any
-# that is fitted from merged ones: ends are compared for whole scenes, and that of 300 sources took
-# a third of the start for nothing.
+# Largest number of components of a scene of small galaxies that is fitted again, and of any scene
+# with galaxies between others: ends are compared for whole scenes, and fitting 300 sources again
+# took a third of their start for nothing.
 MAX_FREED = 30
 
 
 def run_without_doubt(fit, scenes, large):
     """Fits some of the scenes (k,) of a ProfileFit again without contamination of their shapes.
 
-    large: the numbers of those that may hold large galaxies
-
     Scenes in which a step may gain MIN_GAIN are fitted from where they are, and those with galaxies
-    between others from where these have all the light. The best end stays if it gains MIN_BETTER
-    and the sum of E^2, as much as errors of the neighbours' models may feign (population.py): below
-    that structure decides. Shapes of scenes that stay are free until the start ends. Galaxies far
-    fainter than others stay doubted.
+    between others from where the galaxies between have all the light (MAX_FREED). The best end
+    stays if it gains MIN_BETTER and the sum of E^2, as much as errors of the neighbours' models may
+    feign (population.py): below that structure decides. Shapes of scenes that stay are free until
+    the start ends. Galaxies far fainter than others stay doubted.
+
+    large: the numbers of those that may hold large galaxies; of others those with an earlier fit
+        are left out
     """
     few = (fit.source[scenes] >= 0).sum(axis=1) <= MAX_FREED
     few, scenes = (a[(few & ~fit.is_known[scenes]) | np.isin(scenes, large)] for a in (few, scenes))
@@ -53,11 +54,11 @@ def run_without_doubt(fit, scenes, large):
         return
     contamination = fit.population.contamination[scenes]
     doubted = np.where(_is_faint(fit, scenes), contamination, 1)
-    fit.doubt(scenes, doubted)
+    fit.set_contamination(scenes, doubted)
     given = *fit._equations(scenes), fit.population.galaxies[scenes]
     frees = StepControl(len(fit.theta)).next(scenes, *given)[1] > MIN_GAIN
     frees &= (contamination > doubted).any(axis=1)
-    fit.doubt(scenes, contamination)
+    fit.set_contamination(scenes, contamination)
     merged = {b: theta for b in scenes[few] if (theta := _merged(fit, b)) is not None}
     merges = np.isin(scenes, list(merged))
     given = scenes, frees, merges, doubted, (contamination - doubted).sum(axis=1)
@@ -66,13 +67,12 @@ def run_without_doubt(fit, scenes, large):
         return
     before, here = fit._copy(), fit.chi2_as_expected(scenes)
     ends, best, lowest = [(here, _fluxes(fit))], before, np.full(len(scenes), np.inf)
-    for some in (frees, merges):
+    for some, begun in ((frees, {}), (merges, merged)):
         fit._restore(before, scenes)
-        fit.doubt(scenes, doubted)
-        if some is merges:
-            for b in scenes[some]:
-                fit.theta[b] = merged[b]
-            fit._take(scenes[some], doubt=False)
+        fit.set_contamination(scenes, doubted)
+        for b, theta in begun.items():
+            fit.theta[b] = theta
+        fit._take(np.array(list(begun), int), doubt=False)
         fit._step(scenes[some])
         chi2 = np.where(some, fit.chi2_as_expected(scenes), np.inf)
         ends.append((chi2, _fluxes(fit)))
