@@ -297,7 +297,7 @@ class _BatchRunner:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
                 return
-            for fit in fits:
+            for _, fit in group:
                 fit.restart()
             for half in _halves(group):
                 yield from self._try(half)

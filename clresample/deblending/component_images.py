@@ -23,6 +23,13 @@ class ComponentImages:
         self.ndim = len(self.shape)
 
     @classmethod
+    def of(cls, rendered):
+        """The ComponentImages of an array (n, Co, My, Mx), with windows of all pixels."""
+        if isinstance(rendered, cls):
+            return rendered
+        return cls(np.shape(rendered), np.zeros((len(rendered), 2), int), rendered)
+
+    @classmethod
     def cropped(cls, shape, low, images):
         """ComponentImages of windows that may lie partly or wholly outside of the observation."""
         lows, parts = [], []
@@ -51,18 +58,28 @@ class ComponentImages:
             out[i, :, *self.window(i)] = image
         return out
 
-    def window(self, i):
-        """Slices (y, x) of component i's window."""
-        return box_slices(self.low[i], self.images[i].shape[1:])
+    def window(self, *parts, margin=0):
+        """Slices (y, x) of the window of all of some components, and of a margin [px] around it."""
+        low = np.min([self.low[i] for i in parts], axis=0) - margin
+        high = np.max([self.low[i] + self.images[i].shape[1:] for i in parts], axis=0) + margin
+        low, high = np.maximum(low, 0), np.minimum(high, self.shape[2:])
+        return box_slices(low, high - low)
 
     def within(self, i, window):
-        """Component i's image (Co, ny, nx) on a window (slices y, x) that holds its own."""
-        image, start = self.images[i], [part.start for part in window]
+        """Component i's image (Co, ny, nx) on a window (slices y, x), 0 beyond its own."""
+        image, low = self.images[i], [part.start for part in window]
         if tuple(window) == self.window(i):
             return image
-        out = np.zeros((self.shape[1], *(part.stop - part.start for part in window)), self.dtype)
-        out[:, *box_slices(self.low[i] - start, image.shape[1:])] = image
+        shape = [part.stop - part.start for part in window]
+        out = np.zeros((self.shape[1], *shape), self.dtype)
+        here, there = intersect_boxes(low, shape, self.low[i], image.shape[1:])
+        out[:, *here] = image[:, *there]
         return out
+
+    def has_light(self, i, window):
+        """Whether component i has pixels of its own on a window (slices y, x)."""
+        pairs = zip(self.window(i), window, strict=True)
+        return all(max(a.start, b.start) < min(a.stop, b.stop) for a, b in pairs)
 
     def total(self, spectra):
         """sum_i spectra[i] rendered[i], (Co, My, Mx); spectra (n, Co)."""
@@ -73,47 +90,21 @@ class ComponentImages:
 
     def _image(self, i):
         """Component i's image (Co, My, Mx)."""
-        out = np.zeros(self.shape[1:], self.dtype)
-        out[:, *self.window(i)] = self.images[i]
-        return out
+        return self.within(i, box_slices((0, 0), self.shape[2:]))
 
 
-def weighted_sum(rendered, spectra):
-    """sum_i spectra[i] rendered[i], (Co, My, Mx), of a ComponentImages or an array.
+def source_image(result, source, i_observation, window) -> np.ndarray | None:
+    """Model (Co, ny, nx) [counts] of one source on a window (slices y, x) of an observation.
 
-    spectra (n, Co).
+    None where it has no light there.
     """
-    if isinstance(rendered, ComponentImages):
-        return rendered.total(spectra)
-    return np.einsum("nc,ncyx->cyx", spectra, rendered)
-
-
-def window_of(rendered, i, margin=0):
-    """Slices (y, x) of component i's window and a margin [px] around it, in the observation.
-
-    The whole observation for an array.
-    """
-    whole = [slice(0, n) for n in rendered.shape[-2:]]
-    own = rendered.window(i) if isinstance(rendered, ComponentImages) else whole
-    return tuple(
-        slice(max(part.start - margin, 0), min(part.stop + margin, every.stop))
-        for part, every in zip(own, whole, strict=True)
-    )
-
-
-def joint_window(rendered, parts):
-    """Slices (y, x) of a window that holds the light of some components, and so their boxes."""
-    windows = [window_of(rendered, i) for i in parts]
-    return tuple(
-        slice(min(w[k].start for w in windows), max(w[k].stop for w in windows)) for k in (0, 1)
-    )
-
-
-def image_within(rendered, i, window):
-    """Component i's image (Co, ny, nx) on a window (slices y, x) that contains its own."""
-    if isinstance(rendered, ComponentImages):
-        return rendered.within(i, window)
-    return rendered[i][:, *window]
+    channels, rendered = result.channel_slices()[i_observation], result.rendered[i_observation]
+    total = None
+    for i, c in enumerate(result.components):
+        if c.source == source and rendered.has_light(i, window):
+            image = c.spectrum[channels, None, None] * rendered.within(i, window)
+            total = image if total is None else total + image
+    return total
 
 
 def local_chi2(observed, views, channels, spectra, residuals):

@@ -8,13 +8,14 @@ from functools import cached_property
 import numpy as np
 
 from ..drawing.display import ResultDisplay
+from ..sky.box import box_slices
 from ..sky.footprint import Footprint, unobserved
 from ..sky.frame import Frame
 from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
 from ..sky.validation.checks import check_integer
 from .assessment.misfit import Misfit, misfit_of
-from .component_images import ComponentImages, weighted_sum
+from .component_images import ComponentImages, source_image
 from .ended import Ended
 from .posterior.errors import Errors, PosteriorSampler
 from .posterior.sampling import drawn_components, drawn_fluxes
@@ -56,9 +57,9 @@ class Result(ResultDisplay):
 
     observations, frame, sources: the input of the fit; positions of sources in an observation's
         pixels were converted to the frame's; components (n): in the order of the sources
-    rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
-        its PSF: spectrum times this is the model of the data. An array, or a ComponentImages, which
-        stores each component within the window of its light
+    rendered: per observation the ComponentImages (n, Co, My, Mx) [1] of each component's morphology
+        on its pixels under its PSF: spectrum times this is the model of the data. Made of arrays,
+        where these are given
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
@@ -88,7 +89,7 @@ class Result(ResultDisplay):
     frame: Frame
     sources: tuple[Source, ...]
     components: tuple[Component, ...]
-    rendered: tuple[np.ndarray | ComponentImages, ...]
+    rendered: tuple[ComponentImages, ...]
     sky: np.ndarray
     covariance: np.ndarray
     shifts: np.ndarray
@@ -102,6 +103,10 @@ class Result(ResultDisplay):
     unlisted: tuple = ()
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        images = tuple(map(ComponentImages.of, self.rendered))
+        object.__setattr__(self, "rendered", images)
 
     def __getstate__(self):
         """Attributes for pickles and copies, without what is large and derived in no time."""
@@ -158,16 +163,15 @@ class Result(ResultDisplay):
 
         i_observation: number or name of the observation; None = the model frame
         """
-        parts = [(i, c) for i, c in enumerate(self.components) if c.source == i_source]
         if i_observation is None:
-            spectra = np.array([c.spectrum for _, c in parts]).reshape(-1, len(self.channels))
-            origin, morphs = [c.origin for _, c in parts], [c.morphology for _, c in parts]
+            parts = [c for c in self.components if c.source == i_source]
+            spectra = np.array([c.spectrum for c in parts]).reshape(-1, len(self.channels))
+            origin, morphs = [c.origin for c in parts], [c.morphology for c in parts]
             return compose(self.frame.shape, origin, morphs, spectra)
         i_observation = self.index_of(i_observation)
-        channels = self.channel_slices()[i_observation]
-        unit = self.rendered[i_observation]
-        zero = np.zeros(self.observations[i_observation].data.shape)
-        return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
+        shape = self.observations[i_observation].data.shape
+        image = source_image(self, i_source, i_observation, box_slices((0, 0), shape[1:]))
+        return np.zeros(shape) if image is None else image
 
     def as_galsim(self, i_source, channel):
         """One source as a GalSim object: galsim.InterpolatedImage, under the frame's PSF.
@@ -196,7 +200,7 @@ class Result(ResultDisplay):
         channels = self.channel_slices()[i_observation]
         n_channels = channels.stop - channels.start
         spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
-        image = weighted_sum(self.rendered[i_observation], spectra)
+        image = self.rendered[i_observation].total(spectra)
         return image + self.sky[channels, None, None]
 
     def residual(self, i_observation) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.told import named
 
-from clresample.deblending.component_images import ComponentImages, image_within, window_of
+from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.ended import Ended
 from clresample.deblending.linear.rendered_models import RenderedModel, model_of
 from clresample.deblending.profiles import ComponentProfile
@@ -20,8 +20,8 @@ from clresample.sky.sources import ExtendedSource, PointSource
 def test_images_beyond_the_observation_have_an_empty_window(low):
     """Whichever edge they lie beyond."""
     rendered = ComponentImages.cropped((1, 2, 10, 12), [low], [np.ones((2, 4, 5))])
-    window = window_of(rendered, 0)
-    image = image_within(rendered, 0, window)
+    window = rendered.window(0)
+    image = rendered.within(0, window)
     assert image.size == 0 and image.shape == np.zeros((2, 10, 12))[:, *window].shape
     assert not np.asarray(rendered).any()
 

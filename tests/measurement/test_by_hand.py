@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
 
-from clresample.deblending.component_images import ComponentImages, joint_window
+from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.posterior.residuals import max_filtered_residuals
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
@@ -183,6 +183,6 @@ def test_a_window_holds_the_light_of_all_components():
     rendered = ComponentImages.cropped(
         (2, 1, 40, 40), np.array([[3, 4], [20, 25]]), [np.ones((1, 6, 7)), np.ones((1, 8, 9))]
     )
-    assert joint_window(rendered, [0, 1]) == (slice(3, 28), slice(4, 34))
-    assert joint_window(rendered, [1]) == (slice(20, 28), slice(25, 34))
-    assert joint_window(np.ones((2, 1, 40, 41)), [0, 1]) == (slice(0, 40), slice(0, 41))
+    assert rendered.window(0, 1) == (slice(3, 28), slice(4, 34))
+    assert rendered.window(1) == (slice(20, 28), slice(25, 34))
+    assert ComponentImages.of(np.ones((2, 1, 40, 41))).window(0, 1) == (slice(0, 40), slice(0, 41))

@@ -141,7 +141,7 @@ def test_shares_add_up_to_the_data_in_the_models_proportions():
 
 def test_rounding_below_zero_gets_no_share():
     result = two_sources(observations=[observe(Grid.flat((60, 70), SCALE), ("g", "r"), data=1.0)])
-    result.rendered[0][2, :, 30, 28] = -1e-7
+    result.rendered[0].images[2][:, 30, 28] = -1e-7
     shares = redistribute(result, 0)
     assert (shares >= 0).all() and shares[0, 0, 30, 28] == 1
 

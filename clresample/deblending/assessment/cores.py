@@ -9,7 +9,6 @@ import numpy as np
 
 from ...sky.box import intersect_boxes
 from ...sky.sources import PointSource
-from ..component_images import image_within, joint_window, window_of
 from ..inspection.star_psfs import StarPSFs
 from ..start.star_weights import MIN_PSF_ERROR_SIGMA
 
@@ -95,9 +94,9 @@ def _star_changes(result, i, k, place):
     returns (window, [(Co, ny, nx) [counts], ...]): L itself, of a total that is off, and r . grad L
         of a width that is, unless `place` is None
     """
-    own = window_of(result.rendered[i], k, margin=1)
+    own = result.rendered[i].window(k, margin=1)
     spectrum = np.abs(result.components[k].spectrum[result.channel_slices()[i]])
-    changes = [spectrum[:, None, None] * image_within(result.rendered[i], k, own)]
+    changes = [spectrum[:, None, None] * result.rendered[i].within(k, own)]
     if place is not None:
         changes.append(_widening(changes[0], [np.mgrid[own][a] - place[a] for a in (0, 1)]))
     return own, changes
@@ -112,8 +111,8 @@ def _model(result, i, parts):
     spectra = np.abs([result.components[j].spectrum[channels] for j in parts])
     spectra = np.where(spectra.any(axis=0), spectra, 1.0)
     flux = spectra.T @ [result.components[j].morphology.sum() for j in parts]
-    window = joint_window(rendered, parts)
-    images = (image_within(rendered, j, window) for j in parts)
+    window = rendered.window(*parts)
+    images = (rendered.within(j, window) for j in parts)
     model = sum(a[:, None, None] * image for a, image in zip(spectra, images, strict=True))
     return window, model, flux
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.sources import PointSource
-from ..component_images import image_within, window_of
 
 # [FWHM] sigma of the Gaussian by which a point is blurred.
 WIDTH_FWHM = 1.0
@@ -65,8 +64,8 @@ def _products(result, i_observation, k, light, left):
 
     observation, rendered = result.observations[i_observation], result.rendered[i_observation]
     width = WIDTH_FWHM * observation.psf.fwhm_px
-    window = window_of(rendered, k, int(np.ceil(MARGIN * width.max())))
-    image = image_within(rendered, k, window)
+    window = rendered.window(k, margin=int(np.ceil(MARGIN * width.max())))
+    image = rendered.within(k, window)
     wide = [gaussian_filter(a, s, mode="constant") for a, s in zip(image, width, strict=True)]
     scale = 1 / np.sqrt(left.noise)[:, None, None]
     root = scale * np.sqrt(observation.whitened.weights[:, *window]) * left.used[:, *window]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
-from ..component_images import image_within, window_of
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 from .cores import star_variance
 from .extended import WIDE_SIGMAS, extended_light
@@ -218,8 +217,7 @@ def _observed_flux(result, remainders):
     channels = result.channel_slices()
     for rendered, left, part in zip(result.rendered, remainders, channels, strict=True):
         for i, c in enumerate(result.components):
-            window = window_of(rendered, i)
-            image = image_within(rendered, i, window) * left.used[:, *window]
+            image = rendered.images[i] * left.used[:, *rendered.window(i)]
             found[c.source, part] += c.spectrum[part] * image.sum((1, 2))
     for i, c in enumerate(result.components):
         error[c.source] += np.sqrt(np.maximum(result.covariance[:, i, i], 0)) * c.morphology.sum()

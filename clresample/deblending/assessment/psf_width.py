@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.psf import SIGMAS_A_FWHM
-from ..component_images import image_within, window_of
 from ..posterior.residuals import MISFIT_SIGMAS
 
 
@@ -29,7 +28,7 @@ def width_errors(result) -> np.ndarray:
         for k, c in enumerate(result.components):
             if not weight[c.source]:
                 continue
-            image = image_within(result.rendered[i], k, window_of(result.rendered[i], k))
+            image = result.rendered[i].images[k]
             steep = sum((np.diff(image, axis=axis) ** 2).sum(axis=(1, 2)) for axis in (1, 2))
             power = np.maximum((image**2).sum(axis=(1, 2)), 1e-300)
             flux = np.abs(c.spectrum[channels]) * c.morphology.sum()

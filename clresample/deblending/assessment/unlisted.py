@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ...sky.box import intersect_boxes
-from ..component_images import window_of
 from ..inspection.image import InspectedImage, typical_sigma
 from .misfit import MISFIT_FRACTION
 
@@ -59,9 +58,7 @@ def _light_at(result, i, places, chosen):
         if not chosen[s]:
             continue
         whole[s] += spectrum.sum() * component.morphology.sum()
-        window = window_of(result.rendered[i], c)
-        image = result.rendered[i][c][:, *window]
-        start = [part.start for part in window]
+        start, image = result.rendered[i].low[c], result.rendered[i].images[c]
         for k, low in enumerate(lows):
             here, there = intersect_boxes(start, image.shape[1:], low, near[k].shape)
             light[k, s] += spectrum @ (image[:, *here] * near[k][*there]).sum((1, 2))

@@ -6,6 +6,7 @@ import numpy as np
 from astropy import units as u
 
 from ...adapters.astropy import ccddata_of
+from ..component_images import source_image
 from .choice import MissingSource, chosen_observation, chosen_sources
 from .deviations import deviations
 from .separation import (
@@ -14,7 +15,6 @@ from .separation import (
     faintest_light,
     models_on,
     separation_of,
-    source_image,
 )
 from .window import sized_window, window_of
 

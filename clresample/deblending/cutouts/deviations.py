@@ -20,7 +20,7 @@ from ...device.multi_device import one_blas_thread
 from ...resampling.resampler import Resampler
 from ...sky.box import intersect_boxes
 from ...sky.psf_checks import PSFWarning
-from .separation import component_image, source_image
+from ..component_images import source_image
 
 # [FWHM of the observation's PSF] Margin around the window in which components' changes are
 # rendered: less than 1e-3 of a morphology's light reaches the window from further away.
@@ -41,6 +41,7 @@ def deviations(result, chosen, i_observation, window):
 def _of_draws(result, chosen, i_observation, window):
     """Computes the deviations from draws of morphologies and spectra."""
     channels = result.channel_slices()[i_observation]
+    rendered = result.rendered[i_observation]
     o, draws = result.observations[i_observation], result.draws
     corner, shape = _frame_part(result, i_observation, window)
     n_draws = len(draws.samples[0]) if result.components else 0
@@ -53,7 +54,7 @@ def _of_draws(result, chosen, i_observation, window):
         here, there = intersect_boxes(
             (0, 0), shape, np.subtract(c.origin, corner), c.morphology.shape
         )
-        seen = component_image(result.rendered[i_observation], i, window)
+        seen = rendered.within(i, window) if rendered.has_light(i, window) else None
         inside = all(part.stop > part.start for part in here)
         if seen is None and not inside:
             continue
@@ -98,13 +99,13 @@ def _frame_part(result, i_observation, window):
 
 def _of_fluxes(result, chosen, i_observation, window):
     """Computes the deviations from covariances of fluxes; without Errors, of spectra."""
-    channels = result.channel_slices()[i_observation]
+    channels, rendered = result.channel_slices()[i_observation], result.rendered[i_observation]
     n_y, n_x = (part.stop - part.start for part in window)
     units, owners, covariance = [], [], []
     if result.errors is None:
         covariance = result.covariance[channels]
         for i, c in enumerate(result.components):
-            units.append(component_image(result.rendered[i_observation], i, window))
+            units.append(rendered.within(i, window) if rendered.has_light(i, window) else None)
             owners.append(c.source)
     else:
         covariance = result.errors.flux[channels]

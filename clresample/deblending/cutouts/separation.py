@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..component_images import source_image
+
 # Values of a Separation's arrays in pixels outside the image; NaN in all other arrays.
 OUTSIDE = {"weights": 0.0}
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
@@ -173,22 +175,6 @@ def fraction_of(part, total, faintest):
     return np.divide(part, total, out=np.zeros(part.shape), where=lit)
 
 
-def source_image(result, source, i_observation, window) -> np.ndarray | None:
-    """Model (C, ny, nx) [counts] of one source on a window (slices y, x) of an observation.
-
-    None where it has no light there.
-    """
-    channels = result.channel_slices()[i_observation]
-    total = None
-    for i, component in enumerate(result.components):
-        if component.source == source:
-            image = component_image(result.rendered[i_observation], i, window)
-            if image is not None:
-                image = component.spectrum[channels, None, None] * image
-                total = image if total is None else total + image
-    return total
-
-
 def models_on(result, i_observation, window) -> dict[int, np.ndarray]:
     """{source: model (C, ny, nx) [counts]} of all with light on a window of an observation."""
     images = {
@@ -196,25 +182,6 @@ def models_on(result, i_observation, window) -> dict[int, np.ndarray]:
         for source in range(len(result.sources))
     }
     return {source: image for source, image in images.items() if image is not None}
-
-
-def component_image(rendered, i, window):
-    """Component i (C, ny, nx) [1] on a window (slices y, x); None where it has no light there."""
-    if not hasattr(rendered, "window"):
-        return np.asarray(rendered[i])[:, *window]
-    here, there = rendered.window(i), window
-    both = [(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(here, there, strict=True)]
-    if any(low >= high for low, high in both):
-        return None
-    image = rendered.images[i]
-    out = np.zeros((image.shape[0], *(part.stop - part.start for part in window)), image.dtype)
-    to, of = (
-        tuple(slice(low - part.start, high - part.start) for (low, high), part in
-              zip(both, parts, strict=True))
-        for parts in (there, here)
-    )  # fmt: skip
-    out[:, *to] = image[:, *of]
-    return out
 
 
 def faintest_light(total) -> np.ndarray:

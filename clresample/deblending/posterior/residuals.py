@@ -8,7 +8,7 @@ import numpy as np
 
 from ...sky.noise import HALF_WIDTH
 from ...sky.psf import SIGMAS_A_FWHM
-from ..component_images import image_within, joint_window
+from ..component_images import source_image
 from ..solver.multiscale.prior import gaussian
 
 # [sigma] Filtered residual from which a source is flagged as misfitted: noise reaches it in one of
@@ -203,7 +203,9 @@ def _owners(result, i_observation, positions):
     shape = result.observations[i_observation].shape
     owner, most = np.full(shape, -1), np.full(shape, -np.inf)
     for s, window, inside in pixels_in_boxes(result, i_observation, positions):
-        light = _light(result, i_observation, s, window)
+        light = source_image(result, s, i_observation, window)
+        if light is None:
+            continue
         best, first = most[:, *window], owner[:, *window]  # views
         brighter = inside & (light > best)
         np.copyto(first, s, where=brighter)
@@ -222,20 +224,9 @@ def pixels_in_boxes(result, i_observation, positions):
     owners = np.array([c.source for c in result.components], int)
     for s in np.unique(owners):
         parts = np.flatnonzero(owners == s)
-        window = joint_window(result.rendered[i_observation], parts)
+        window = result.rendered[i_observation].window(*parts)
         (y, x), inside = np.moveaxis(positions[window], -1, 0), None
         for (y0, x0), (n_y, n_x) in (boxes[i] for i in parts):
             one = (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
             inside = one if inside is None else inside | one
         yield s, window, inside
-
-
-def _light(result, i_observation, source, window):
-    """One source's model (Co, ny, nx) on a window of an observation."""
-    channels = result.channel_slices()[i_observation]
-    rendered, total = result.rendered[i_observation], 0.0
-    for i, c in enumerate(result.components):
-        if c.source == source:
-            image = image_within(rendered, i, window)
-            total = total + c.spectrum[channels, None, None] * image
-    return total

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from ...sky.sources import PointSource
-from ..component_images import image_within, window_of
 from ..linear.ties import Ties
 from ..profiles import MIN_LIGHT, MIN_STAR_LIGHT
 
@@ -86,8 +85,7 @@ def light_on_pixels(result) -> np.ndarray:
     parts = zip(result.channel_slices(), result.rendered, result.footprints, strict=True)
     for channels, rendered, footprint in parts:
         for i, c in enumerate(result.components):
-            window = window_of(rendered, i)
-            image = image_within(rendered, i, window) * footprint.used[:, *window]
+            image = rendered.images[i] * footprint.used[:, *rendered.window(i)]
             seen[i, channels] = image.sum((1, 2), dtype=np.float64) / max(c.morphology.sum(), 1e-30)
     ties = Ties.of([band for o in result.observations for band in o.bands])
     return seen if ties is None else ties.spread(ties.total(seen))
