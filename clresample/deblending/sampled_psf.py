@@ -12,13 +12,12 @@ import functools
 
 import numpy as np
 
+from ..sky.frame import MIN_TRANSFER
 from .inspection.star_psfs import StarPSFs
 
 # [px] Largest distance of a frame's pixels from those of an observation on which it lies: the
 # phase of a wave of one pixel is then right within 0.1.
 MAX_OFFSET_PX = 0.02
-# [1] Transfer below which a PSF's waves are noise, and those of the model's PSF replace them.
-MIN_TRANSFER = 1e-3
 # [px] Largest distance from a star at which its PSF's samples count.
 MAX_REACH_PX = 64
 # [1] Mean transfer of waves of two pixels below which a PSF is as if sampled on the pixels: that of
@@ -79,7 +78,8 @@ def alias_tables(psfs, n_fft):
 
         T_m(nu) = P^*(nu) P^(nu + m) / (|P^(nu)|^2 + e^2),   e^2 / (|P^(nu)|^2 + e^2)
 
-    P: mean of all bands of the PSFs; e: MIN_TRANSFER
+    P: mean of all bands of the PSFs
+    e: MIN_TRANSFER, below which the waves are those of the model's PSF
     returns (3, 3, n_fft, n_fft // 2 + 1), m = -1, 0, 1 along y and x, and
         (n_fft, n_fft // 2 + 1), in the order of a real FFT; in float32, as images are drawn
     """

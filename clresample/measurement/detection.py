@@ -372,8 +372,10 @@ def _companions(sep, signals, one, everything, places, threshold, fwhm, scale, *
         level = local_level(rest, at, round(LEVEL_FWHM * fwhm))
         if height - level < MIN_PEAK_SIGMA * noise[tuple(at)]:
             continue
-        # two peaks on either side of a maximum are one source
-        if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
+        # two peaks on either side of a maximum are one source, as is what pixels as large as the
+        # PSF leave beside a star's own maximum
+        others = [*centres, *(position for position, _ in found)]
+        if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p in others):
             continue
         if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:
             continue

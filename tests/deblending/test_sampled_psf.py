@@ -9,8 +9,9 @@ from clresample.deblending.batch import deblend
 from clresample.deblending.inspection.star_psfs import StarPSFs
 from clresample.deblending.profiles import ALIAS_PX, StarProfile, draw_psf
 from clresample.deblending.sampled_psf import MAX_REACH_PX, reach_px, sampled_psfs
+from clresample.measurement.photometry import fluxes
 from clresample.resampling.resampler import Resampler
-from clresample.sky.frame import Frame, model_psf
+from clresample.sky.frame import Frame, model_frame, model_psf
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation, with_psf_field
 from clresample.sky.psf import PSF
@@ -21,18 +22,20 @@ GRID = Grid.flat(SHAPE, 0.1)
 PLACES = [(20.0, 22.0), (20.5, 22.5), (19.7, 21.2)]
 
 
-def pixel_psf():
-    """The effective PSF, of a Gaussian behind square pixels, four samples a pixel."""
-    u = (np.arange(81) - 40) / 4
-    edges = [erf((u + d) / (np.sqrt(2) * SIGMA)) for d in (0.5, -0.5)]
-    return PSF(np.outer(edges[0] - edges[1], edges[0] - edges[1]), spacing=0.25)
+def pixel_psf(*sigmas):
+    """The effective PSF, of Gaussians behind square pixels, four samples a pixel."""
+    u, images = (np.arange(81) - 40) / 4, []
+    for sigma in sigmas or (SIGMA,):
+        edges = [erf((u + d) / (np.sqrt(2) * sigma)) for d in (0.5, -0.5)]
+        images.append(np.outer(edges[0] - edges[1], edges[0] - edges[1]))
+    return PSF(np.array(images), spacing=0.25)
 
 
-def exact_light(place):
+def exact_light(place, sigma=SIGMA):
     """Light in the pixels of a star of unit flux at a place (2,) [px]."""
     sides = []
     for n, c in zip(SHAPE, place, strict=True):
-        edges = erf((np.arange(n + 1) - 0.5 - c) / (np.sqrt(2) * SIGMA))
+        edges = erf((np.arange(n + 1) - 0.5 - c) / (np.sqrt(2) * sigma))
         sides.append(np.diff(edges) / 2)
     return np.outer(*sides)
 
@@ -53,6 +56,33 @@ def test_stars_are_exact_on_the_pixels_that_alias_their_light(device, place):
     )
     assert np.abs(own).max() < 1e-3 * wanted.max()
     assert np.abs(smooth).max() > 0.02 * wanted.max()
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_bands_whose_light_the_pixels_alias_differently_need_finer_ones(device, together):
+    """As two bands of Roman: on their own pixels no image of a star has the waves of both."""
+    widths, flux = (0.4, 0.55), 3000.0
+    light = flux * np.array([exact_light(PLACES[2], sigma) for sigma in widths])
+    data = light + np.random.default_rng(0).normal(size=light.shape)
+    psf, bands = pixel_psf(*widths), ([0, 1],) if together else ([0], [1])
+    observations = [
+        Observation(data[k], psf[k], GRID, weights=1.0, channels=tuple("ab"[i] for i in k))
+        for k in bands
+    ]
+    star, off = [PointSource(position_px=PLACES[2], observation=observations[0].label)], []
+    for grid in (None, GRID):
+        frame = model_frame(observations, grid=grid)
+        found = deblend(observations, star, frame=frame, device=device)
+        off.append(np.abs(fluxes(found)[0] / flux - 1).max())
+        assert (frame.shape == SHAPE) == (grid is GRID)
+    assert off[0] < 0.01 and off[1] > 0.03
+    same = pixel_psf(0.3, 0.3)
+    assert model_frame([observation(same[0])]).shape == SHAPE
+    once, again = (
+        Observation(np.zeros(SHAPE), same[k], GRID, weights=1.0, channels=("ab"[k],))
+        for k in (0, 1)
+    )
+    assert model_frame([once, again]).shape == SHAPE
 
 
 def test_slopes_are_those_by_the_position():
