@@ -77,7 +77,7 @@ class ComponentImages:
         return out
 
     def has_light(self, i, window):
-        """Whether component i has pixels of its own on a window (slices y, x)."""
+        """Returns True if component i has pixels of its own on a window (slices y, x)."""
         pairs = zip(self.window(i), window, strict=True)
         return all(max(a.start, b.start) < min(a.stop, b.stop) for a, b in pairs)
 
