@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.profiles import (
-    COMPONENT_SPREAD,
     FixedProfile,
     GalaxyProfile,
     StarProfile,
@@ -19,74 +17,15 @@ from clresample.deblending.solver.multiscale.structure import coarse_count
 from clresample.deblending.solver.scene import State, StructureState
 from clresample.deblending.start import first_scene
 from clresample.deblending.start.profile_start import StartingPoint, StartInput
-from clresample.deblending.view import WhitenedView
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource, PointSource
 
 
-def test_the_second_start_is_from_what_the_others_leave():
-    """Their light and the sky are taken off the data, in every channel of each observation."""
-    rng, shape = np.random.default_rng(6), (5, 4)
-    spectra, sky = rng.uniform(1, 2, (3, 3)), np.array([0.5, -0.25, 0.125])
-    parts, views, observed = [slice(0, 1), slice(1, 3)], [], []
-    begin = SimpleNamespace(
-        source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)), thetas=rng.random((3, 4))
-    )
-    for part in parts:
-        images = rng.random((3, part.stop - part.start, *shape))
-        observed.append(ComponentImages(images.shape, np.zeros((3, 2), int), list(images)))
-        data, root = rng.normal(size=images.shape[1:]), np.ones(images.shape[1:])
-        shares = rng.random((3, part.stop - part.start, 2))
-        views.append(WhitenedView(None, None, None, None, root, data, shares))
-    fit = SimpleNamespace(
-        state=SimpleNamespace(spectra=spectra, sky=sky),
-        scene=SimpleNamespace(channels=lambda: parts),
-        start=begin,
-        views=views,
-        frame="home",
-    )
-    patch = second._alone(
-        fit, GradientTest(np.array([1]), np.array([9.0]), np.ones((1, 3)), observed)
-    )
-    for view, own, images, part in zip(views, patch.views, observed, parts, strict=True):
-        others = np.einsum("ic,icyx->cyx", spectra[[0, 2], part], np.asarray(images)[[0, 2]])
-        np.testing.assert_allclose(own.data, view.data - others - sky[part, None, None])
-        np.testing.assert_array_equal(own.coefficients, view.coefficients[[2]])
-    (source,) = patch.sources
-    assert source.n_components == 2 and patch.frame == "home"
-    np.testing.assert_array_equal(patch.positions, begin.positions[[2]])
-    np.testing.assert_array_equal(source.position_px, begin.positions[2])
-    ((smaller, larger),) = patch.thetas
-    np.testing.assert_allclose(larger - smaller, [COMPONENT_SPREAD, 0, 0, 0], atol=1e-12)
-    np.testing.assert_allclose((larger + smaller) / 2, begin.thetas[1])
-    assert fit.state.spectra.all()  # the first fit's own stay
-
-
-def test_the_second_fit_takes_the_place_of_the_chosen_components():
-    """Two each, in the order of the sources."""
-
-    def point(n, first):
-        fields = {
-            name: np.arange(n) + first
-            for name in ("peaks", "spectra", "spectrum_curvature", "drawn_positions")
-        }
-        return fields | {"shapes": list("abcdef"[:n]), "thetas": [first] * n}
-
-    others = {"positions": np.zeros((3, 2)), "undetected": np.zeros(3, bool), "sky": np.zeros(1)}
-    begin = StartingPoint(source=np.array([0, 2, 1]), **others, **point(3, 0))
-    found = StartingPoint(source=np.array([0, 0, 1, 1]), **others, **point(4, 10))
-    joined = second._joined(begin, found, np.array([2, 0]))
-    assert joined.source.tolist() == [0, 0, 2, 1, 1]
-    for name in ("peaks", "spectra", "spectrum_curvature", "drawn_positions"):
-        assert getattr(joined, name).tolist() == [12, 13, 1, 10, 11]
-    assert joined.shapes == list("cdbab") and joined.thetas == [10, 10, 0, 10, 10]
-
-
 def test_a_second_fit_goes_on_where_the_first_has_ended():
-    """Two components in place of one begin on their profiles, with its strengths; all else where it
-    was left, also what has a core beside it."""
+    """A core begins on its profile, with the strengths of what it is beside; all else where it was
+    left."""
     rng, prior = (
         np.random.default_rng(8),
         MultiscalePrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.2)),
@@ -104,25 +43,21 @@ def test_a_second_fit_goes_on_where_the_first_has_ended():
     known = StructureState([coefficients(s) for s in shapes], rng.random((3, 2)), np.arange(3) == 1)
     end, chosen = state(shapes, known), np.array([1])
     first = SimpleNamespace(state=end, settings=SimpleNamespace(prior=prior))
-    cases = (
-        (second._places, ((4, 5), (8, 9), (7, 5), (3, 3)), {0: 0, 3: 2}),
-        (second._cores, ((4, 5), (6, 7), (7, 5), (3, 3)), {0: 0, 1: 1, 3: 2}),
-    )
-    for places, boxes, kept in cases:
-        begin = state(boxes)
-        found = second._going_on(begin, first, *places(3, chosen))
-        for k, box in enumerate(boxes):
-            own = found.learned.structure[k]
-            if k in kept:
-                np.testing.assert_array_equal(found.morph[k], end.morph[kept[k]])
-                assert own is known.structure[kept[k]]
-                continue
-            assert found.morph[k] is begin.morph[k]
-            assert not any(part.any() for part in own)
-            for part, step in zip(own, prior.steps, strict=True):
-                assert part.shape == tuple(coarse_count(n, step) for n in box)
-        np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
-        assert found.learned.clear.tolist() == [False, True, True, False]
+    boxes, kept = ((4, 5), (6, 7), (7, 5), (3, 3)), {0: 0, 1: 1, 3: 2}
+    begin = state(boxes)
+    found = second._going_on(begin, first, *second._cores(3, chosen))
+    for k, box in enumerate(boxes):
+        own = found.learned.structure[k]
+        if k in kept:
+            np.testing.assert_array_equal(found.morph[k], end.morph[kept[k]])
+            assert own is known.structure[kept[k]]
+            continue
+        assert found.morph[k] is begin.morph[k]
+        assert not any(part.any() for part in own)
+        for part, step in zip(own, prior.steps, strict=True):
+            assert part.shape == tuple(coarse_count(n, step) for n in box)
+    np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
+    assert found.learned.clear.tolist() == [False, True, True, False]
 
 
 def test_a_core_begins_beside_each_component_in_question():
@@ -182,10 +117,13 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
 
 
 def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
-    """They alone; each of its three starts from what it should be made of."""
+    """They alone; each of its two starts from what it should be made of."""
 
     def clear(*which):
         return SimpleNamespace(significant=np.array(which, int))
+
+    def begun(name, estimate=()):
+        return StartingPoint([0], [0], [], [], [name], 0, 0, 0, 0, 0, flux_estimate=estimate)
 
     asked = [None, clear(1), clear(), clear(0, 2)]
     settings, tols = SimpleNamespace(fit_sky=True, start_tol=25.0), []
@@ -194,16 +132,18 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
     fits = [SimpleNamespace(name=i, start=[i] * 3, **given) for i in range(4)]
     kept = []
     monkeypatch.setattr(second, "run_gradient_tests", lambda fits: asked)
-    monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
     monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
     monkeypatch.setattr(
         second,
         "fit_start_profiles",
         lambda patches, fit_sky=False, *, tol: tols.append(tol) or patches,
     )
-    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin[0]}")
-    monkeypatch.setattr(second, "_as_before", lambda whole, begin, _: f"{whole} as {begin[0]}")
-    monkeypatch.setattr(second, "_with_cores", lambda fit, one: f"cores {one.significant.tolist()}")
+    monkeypatch.setattr(
+        second, "_as_before", lambda whole, begin, _: begun(f"{whole} as {begin[0]}", "zero")
+    )
+    monkeypatch.setattr(
+        second, "_with_cores", lambda fit, one: begun(f"cores {one.significant.tolist()}")
+    )
     monkeypatch.setattr(
         second, "_again", lambda fit, point: SimpleNamespace(point=point, state="new")
     )
@@ -215,22 +155,21 @@ def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
     monkeypatch.setattr(
         second, "best_starts", lambda starts, fit_sky, n_kept: kept.append(n_kept) or starts
     )
-    begun = second.start_refits(fits)
-    np.testing.assert_array_equal(kept[0], [[3 + 11, 0, 21], [7, 0, 21]])  # structure that is kept
-    assert {i: [(one.point, one.state) for one in three] for i, three in begun.items()} == {
+    again = second.start_refits(fits)
+    np.testing.assert_array_equal(kept[0], [[0, 21], [0, 21]])  # structure that is kept
+    assert {i: [(one.point.thetas, one.state) for one in two] for i, two in again.items()} == {
         1: [
-            ("alone 1 in 1", (1, [0, 1, 1, 2], [False, True, True, False])),
-            ("all 1 [1] as 1", "new"),
-            ("cores [1]", (1, [0, 1, 1, 2], [False, False, True, False])),
+            (["all 1 [1] as 1"], "new"),
+            (["cores [1]"], (1, [0, 1, 1, 2], [False, False, True, False])),
         ],
         3: [
-            ("alone 3 in 3", (3, [0, 0, 1, 2, 2], [True, True, False, True, True])),
-            ("all 3 [0, 2] as 3", "new"),
-            ("cores [0, 2]", (3, [0, 0, 1, 2, 2], [False, True, False, False, True])),
+            (["all 3 [0, 2] as 3"], "new"),
+            (["cores [0, 2]"], (3, [0, 0, 1, 2, 2], [False, True, False, False, True])),
         ],
     }
+    assert {one.point.flux_estimate for two in again.values() for one in two} == {"zero"}
     asked[1] = asked[3] = None
-    assert second.start_refits(fits) == {} and tols == [25.0, 25.0]
+    assert second.start_refits(fits) == {} and tols == [25.0]
 
 
 def test_the_other_start_takes_galaxies_over():

@@ -1,4 +1,4 @@
-"""Starting models of two-component fits: the best one of three candidates.
+"""Starting models of two-component fits: the better one of two candidates.
 
 For a bulge with a disc, smooth profiles of two components are the best start. In a merger they
 would lose most of the fitted structure: there the fitted component is kept, and a core is added to
@@ -12,13 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...sky.sources import ExtendedSource
 from ..ended import Ended
 from ..profiles import COMPONENT_SPREAD, FixedProfile, GalaxyProfile
 from ..solver.multiscale.structure import no_structure
 from ..solver.scene import StructureState
 from ..start.first_scene import best_starts, first_scene
-from ..start.profile_start import StartInput, fit_start_profiles, profile_peak
+from ..start.profile_start import fit_start_profiles, profile_peak
 from .colour_gradient import run_gradient_tests
 
 # Ratio of the sigma of an added core to that of its component: that of a Gaussian's square, which
@@ -29,11 +28,9 @@ CORE = 0.5**0.5
 def start_refits(fits):
     """{index: a Fit at its start} of the scenes with sources that clearly need two components.
 
-    Of three starts the best one where it begins, with the best spectra, see `best_starts`:
-    known   all other components from the first fit, with structure and strengths, and smooth
-            profiles of the two components, fitted to the rest of the data: the neighbours' models
-            are good, but their structure may contain light of the component in question
-    whole   smooth profiles only, those of all other components from the first start
+    Of two starts the better one where it begins, with the best spectra, see `best_starts`:
+    whole   smooth profiles of two components, and those of all other components from the first
+            start
     beside  all components from the first fit, and a core added to each component in question: all
             structure is kept, whichever component contains it
     """
@@ -45,21 +42,17 @@ def start_refits(fits):
     if not asked:
         return {}
     fit_sky, tol = fits[0].settings.fit_sky, fits[0].settings.start_tol
-    alone = fit_start_profiles([_alone(fits[i], one) for i, one in asked.items()], tol=tol)
     patches = [_together(fits[i], one.significant) for i, one in asked.items()]
     together = fit_start_profiles(patches, fit_sky=fit_sky, tol=tol)
     starts, n_kept = [], []
-    for (i, one), own, all_smooth in zip(asked.items(), alone, together, strict=True):
+    for (i, one), all_smooth in zip(asked.items(), together, strict=True):
         first = fits[i]
-        known = _again(first, _joined(first.start, own, one.significant))
-        known.state = _going_on(known.state, first, *_places(len(first.start), one.significant))
-        whole = _again(first, _as_before(all_smooth, first.start, one.significant))
-        beside = _again(first, _with_cores(first, one))
+        point = _as_before(all_smooth, first.start, one.significant)
+        whole = _again(first, point)
+        beside = _again(first, replace(_with_cores(first, one), flux_estimate=point.flux_estimate))
         beside.state = _going_on(beside.state, first, *_cores(len(first.start), one.significant))
-        starts.append((known, whole, beside))
-        determined = first.strength_estimates.n_effective.sum(axis=1)
-        others = np.delete(determined, one.significant)
-        n_kept.append([others.sum(), 0.0, determined.sum()])
+        starts.append((whole, beside))
+        n_kept.append([0.0, first.strength_estimates.n_effective.sum()])
     return dict(zip(asked, best_starts(starts, fit_sky, np.array(n_kept)), strict=True))
 
 
@@ -123,47 +116,6 @@ def _as_before(point, begin, chosen):
         flux_estimate=estimate,
         flux_doubt=begin.flux_doubt,
     )
-
-
-def _alone(fit, asked):
-    """The StartInput of sources that need two components, with others' light subtracted."""
-    chosen, begin = asked.significant, fit.start
-    spectra = fit.state.spectra.copy()
-    spectra[chosen] = 0
-    views = []
-    for view, seen, part in zip(fit.views, asked.observed, fit.scene.channels(), strict=True):
-        others = seen.total(spectra[:, part]) + fit.state.sky[part, None, None]
-        own = view.for_sources(begin.source[chosen])
-        views.append(replace(own, data=view.data - others))
-    positions = begin.positions[begin.source[chosen]]
-    sources = [ExtendedSource(position_px=tuple(map(float, p)), n_components=2) for p in positions]
-    thetas = [_split(begin.thetas[i]) for i in chosen]
-    return StartInput(fit.frame, sources, positions, views, thetas)
-
-
-def _joined(begin, point, chosen):
-    """A StartingPoint with the components of `point`, two each, in place of those `chosen` (k,)."""
-    order = []
-    for i in range(len(begin)):
-        own = 2 * np.flatnonzero(chosen == i)
-        order += [(point, own[0]), (point, own[0] + 1)] if len(own) else [(begin, i)]
-    source = [begin.source[chosen[k // 2]] if p is point else begin.source[k] for p, k in order]
-    parts = {
-        name: [getattr(p, name)[k] for p, k in order]
-        for name in (
-            "shapes",
-            "thetas",
-            "drawn_positions",
-            "peaks",
-            "spectra",
-            "spectrum_curvature",
-        )
-    }
-    arrays = {
-        name: np.array(parts[name])
-        for name in ("drawn_positions", "peaks", "spectra", "spectrum_curvature")
-    }
-    return replace(begin, source=np.array(source), **(parts | arrays))
 
 
 def _with_cores(fit, asked):
