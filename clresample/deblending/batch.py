@@ -227,7 +227,7 @@ class _BatchRunner:
         Each comes with the number of blends that it finishes; a group is empty if a blend has
         failed.
         """
-        waiting = defaultdict(list)
+        waiting, held = defaultdict(list), defaultdict(lambda: np.zeros(2, int))
         for i, blend in enumerate(self.blends):
             try:
                 check_instance("blend", blend, Blend)
@@ -236,14 +236,15 @@ class _BatchRunner:
                 self.done[i] = _failure(blend, error)
                 yield 1, []
                 continue
-            group = waiting[fit.signature]
-            group.append((i, fit))
-            n_sources = [len(f.fitted) for _, f in group]
-            full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
-            full |= sum(n_sources) >= self.tuning.start_sources
-            full |= sum(n_sources) + n_sources[-1] > MAX_SOURCES
-            if full or len(group) >= self.tuning.n_scenes:
-                yield self._begun(waiting.pop(fit.signature))
+            key, own = fit.signature, np.array([data_bytes(fit), len(fit.fitted)])
+            waiting[key].append((i, fit))
+            held[key] += own
+            n_bytes, n_sources = held[key] + own  # with another one like this
+            full = n_bytes > self.memory or n_sources > MAX_SOURCES
+            full |= n_sources - own[1] >= self.tuning.start_sources
+            if full or len(waiting[key]) >= self.tuning.n_scenes:
+                del held[key]
+                yield self._begun(waiting.pop(key))
         while waiting:
             yield self._begun(waiting.popitem()[1])
 

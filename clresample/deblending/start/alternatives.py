@@ -49,7 +49,8 @@ class Alternatives:
             for i, present in zip(self.component, self._is_first, strict=True)
         ]
         stars, spectra = fit.population.stars[fit.at][:, None], looking.spectra
-        parts = [_residuals(looking, part) for part in (0 * spectra, spectra * stars, spectra)]
+        parts = [_residuals(looking, part) for part in (0 * spectra, spectra)]
+        parts.insert(1, _residuals(looking, spectra * stars) if stars.any() else parts[0])
         peaks = peaks_of(self.listed, self.theta)
         brightness = fit.brightness[self.component] * faint
         brightness *= np.minimum(peaks / peaks[self.first][self.owner], 1)
