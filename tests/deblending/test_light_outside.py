@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from helpers.blends import SCALE, blend, gaussian, observe, one_source
 
-from clresample.deblending.assessment.edge import continued, light_outside, reaches_outside, widened
+from clresample.deblending.assessment.edge import continued, light_outside, reaches_outside
 from clresample.deblending.posterior.errors import Errors
+from clresample.deblending.posterior.shared_light import flux_changes
 from clresample.deblending.profiles import GalaxyProfile
 from clresample.deblending.result import Component, noted
 from clresample.measurement.catalogue import Flag, catalogue
@@ -73,6 +74,12 @@ def errors_of(result, sigma):
     return Errors(variance, colour, moments, maps, np.zeros((1, 6)), *zero)
 
 
+def with_light(errors, outside):
+    """These with light outside, as a fit's."""
+    changes = flux_changes(np.zeros((1, 2, 0)), np.zeros((1, 1, 2)), outside[None])
+    return replace(changes.added_to(errors), outside=outside)
+
+
 def test_a_galaxys_profile_says_how_much_is_outside():
     """If it is the smaller estimate; it is not much less than the true light of such a galaxy."""
     for sigma_px in (4.0, 8.0, 14.0):
@@ -89,7 +96,7 @@ def test_edge_and_errors_have_the_light_outside():
         result, given, _ = galaxy(sigma_px)
         outside = light_outside(result, *given)
         before = errors_of(result, 30.0)
-        errors = widened(before, outside)
+        errors = with_light(before, outside)
         np.testing.assert_allclose(errors.flux[:, 0, 0], 30.0**2 + outside[0] ** 2)
         np.testing.assert_allclose(errors.colour[0, 0, 1], outside[0, 0] * outside[0, 1])
         found = replace(result, errors=errors)
@@ -104,7 +111,7 @@ def test_edge_and_errors_have_the_light_outside():
 def test_noise_at_the_edge_is_no_light_there():
     """A flux whose noise is larger than what is outside."""
     result, given, _ = galaxy(14.0)
-    errors = widened(errors_of(result, 1.0), light_outside(result, *given))
+    errors = with_light(errors_of(result, 1.0), light_outside(result, *given))
     noisy = replace(result, errors=errors, covariance=np.full((2, 1, 1), 1e4))
     assert not reaches_outside(noisy, np.array([c.flux for c in result.components])).any()
 

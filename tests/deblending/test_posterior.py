@@ -57,7 +57,7 @@ def test_blended_sources_exchange_light(device, monkeypatch):
     monkeypatch.setattr(
         posterior, "exchanged_light", lambda *own: given.append(own[2]) or exchanged(*own)
     )
-    monkeypatch.setattr(posterior, "with_shared_light", lambda errors, *_: errors)
+    monkeypatch.setattr(posterior, "flux_changes", lambda *_: None)
     kept = capture(monkeypatch)
     result = scenes.fit(blend(PAIR), device, settings=BARE)
     assert given[0] is shapes  # light is searched for where it would be if these are wrong

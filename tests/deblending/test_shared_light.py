@@ -16,7 +16,6 @@ from clresample.deblending.posterior.shared_light import (
     DoubtedShape,
     exchanged_light,
     flux_changes,
-    with_shared_light,
 )
 from clresample.deblending.profiles import SIZE_SCATTER, GalaxyProfile
 from clresample.deblending.result import Component
@@ -122,17 +121,17 @@ def test_exchanged_light_leaves_the_sum_of_two_fluxes_alone():
     flux, colour = np.zeros((2, 3, 3)), np.zeros((3, 2, 2))
     nothing = np.zeros((3, 5, 5)), (), np.zeros((3, 6)), np.zeros((3, 2)), np.zeros((3, 5))
     errors = Errors(flux, colour, *nothing, np.zeros((3, 2)))
-    found = with_shared_light(errors, doubts[..., :0], exchanged, none)
+    found = flux_changes(doubts[..., :0], exchanged, none).added_to(errors)
     np.testing.assert_allclose(found.flux[0], [[34, -34, 0], [-34, 34, 0], [0, 0, 0]])
     np.testing.assert_allclose(found.colour[0], found.colour[1])
     np.testing.assert_allclose(found.colour[0], [[34, 12], [12, 16]])
-    found = with_shared_light(errors, doubts, exchanged, none)
+    found = flux_changes(doubts, exchanged, none).added_to(errors)
     np.testing.assert_allclose(found.colour[2], doubts[2] @ doubts[2].T)
     np.testing.assert_allclose(found.flux[1, 0, 2], doubts[0, 1] @ doubts[2, 1])
     of_both = np.diagonal(found.colour, axis1=1, axis2=2), np.diagonal(found.flux, axis1=1, axis2=2)
     np.testing.assert_allclose(of_both[0], of_both[1].T)
     own = rng.normal(size=(2, 3, 2))
-    more, found = found, with_shared_light(errors, doubts, exchanged, own)
+    more, found = found, flux_changes(doubts, exchanged, own).added_to(errors)
     np.testing.assert_allclose(found.colour[1] - more.colour[1], own[:, 1].T @ own[:, 1])
     wanted = np.diag(np.square(own[:, :, 0]).sum(axis=0))
     np.testing.assert_allclose(found.flux[0] - more.flux[0], wanted, atol=1e-12)
@@ -156,11 +155,11 @@ def test_a_faint_galaxy_in_a_bright_ones_light_is_less_certain(device, monkeypat
     )
     seen = []
 
-    def spied(errors, doubts, *others):
+    def spied(doubts, *others):
         seen.append(doubts)
-        return with_shared_light(errors, doubts, *others)
+        return flux_changes(doubts, *others)
 
-    monkeypatch.setattr(posterior, "with_shared_light", spied)
+    monkeypatch.setattr(posterior, "flux_changes", spied)
     result = fit(blend(objects, shape=(30, 90), seed=5), device)
     flux = np.linalg.norm([c.flux for c in result.components], axis=1)
     doubt = np.linalg.norm(seen[0], axis=(1, 2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -166,14 +165,3 @@ def _widening(light, away):
 def _box(window):
     """Origin and shape (2,) [px] of a window (slices y, x)."""
     return tuple(zip(*((part.start, part.stop - part.start) for part in window), strict=True))
-
-
-def with_core_errors(errors, cores):
-    """Errors that include `core_errors` (S, C) [counts], independent between channels."""
-    if not cores.any():
-        return errors
-    flux, colour, s = errors.flux.copy(), errors.colour.copy(), np.arange(len(cores))
-    flux[:, s, s] += cores.T**2
-    c = np.arange(cores.shape[1])
-    colour[:, c, c] += cores**2
-    return replace(errors, flux=flux, colour=colour)

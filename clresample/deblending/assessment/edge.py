@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..profiles import GalaxyProfile
@@ -106,17 +104,6 @@ def _tail(brightness):
     scale = min(1 / max(fall, 1e-30), MAX_SCALE * end)
     at_end = outer * np.exp(-n / 2 / scale)
     return 2 * np.pi * at_end * scale * (end + scale)
-
-
-def widened(errors, outside):
-    """Errors of fluxes widened by the light outside the observed area (S, C) [counts].
-
-    The error of this light is assumed as large as the light, and common to a source's channels.
-    """
-    flux, s = errors.flux.copy(), np.arange(len(outside))
-    flux[:, s, s] += outside.T**2
-    colour = errors.colour + outside[:, :, None] * outside[:, None, :]
-    return replace(errors, flux=flux, colour=colour, outside=outside)
 
 
 def reaches_outside(result, flux) -> np.ndarray:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import strmm
+from scipy.sparse import csr_array
 
 from ..linear.block_matrix import RIDGE, BlockCholesky
 from ..linear.mode_images import ModeImages, combined
@@ -84,6 +85,16 @@ class FluxChanges:
         out = np.zeros((n_sources, self.by.shape[1]))
         np.add.at(out, self.source, values[self.change, None] * self.by)
         return out
+
+    def added_to(self, errors) -> Errors:
+        """Errors with the covariance of these changes too."""
+        flux, colour = errors.flux.copy(), errors.colour.copy()
+        np.add.at(colour, self.source, self.by[:, :, None] * self.by[:, None])
+        shape = len(colour), self.change.max(initial=-1) + 1
+        for own, by in zip(flux, self.by.T, strict=True):
+            changes = csr_array((by, (self.source, self.change)), shape)
+            own += (changes @ changes.T).toarray()
+        return replace(errors, flux=flux, colour=colour)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..assessment.cores import core_errors, with_core_errors
-from ..assessment.edge import light_outside, widened
+from ..assessment.cores import core_errors
+from ..assessment.edge import light_outside
 from ..assessment.extended import missed_light
 from ..assessment.psf_width import width_errors
 from ..assessment.status import with_misfit_status
@@ -30,7 +30,6 @@ from .shared_light import (
     exchanged_light,
     flux_changes,
     flux_doubts,
-    with_shared_light,
 )
 
 # Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
@@ -224,7 +223,6 @@ def with_errors(fit, result, peaks, seen):
     change[fit.fitted], scatter[fit.fitted], noise[fit.fitted] = estimate
     errors = replace(errors, flux_correction=errors.flux_correction + change)
     unsettled = unsettled_fluxes(fit)
-    errors = with_core_errors(widened(errors, outside), core_errors(result))
     doubted = doubted_shapes(posterior)
     doubts = flux_doubts(posterior, doubted, owner, len(result.sources)) * fit.unit[:, None]
     division = np.zeros((*noise.shape, start.flux_doubt.shape[2]))
@@ -236,10 +234,14 @@ def with_errors(fit, result, peaks, seen):
     by_band = np.where(bands.T[:, None], np.hypot(width_errors(result), noise), 0)
     own = np.stack([*floors, missed_light(result), scatter, *by_band])
     doubts = np.concatenate([doubts, division, largest_changes(unsettled, fit.unit)], axis=2)
-    changes = doubts, exchanged_light(result, posterior.solution, doubted), own
+    shared = doubts, exchanged_light(result, posterior.solution, doubted)
+    # Not drawn is the light outside, common to a source's channels, and that of cores, of each.
+    cores = np.eye(len(fit.unit))[:, None] * core_errors(result)
+    changes = flux_changes(*shared, np.concatenate([own, outside[None], cores]))
+    errors = errors if changes is None else changes.added_to(errors)
     largest = np.abs(unsettled).max(axis=2, initial=0)
-    errors = replace(with_shared_light(errors, *changes), unsettled=largest)
-    draws = replace(draws, flux_changes=flux_changes(*changes))
+    errors = replace(errors, outside=outside, unsettled=largest)
+    draws = replace(draws, flux_changes=flux_changes(*shared, own))
     return noted(result, errors=errors, draws=draws)
 
 

@@ -33,7 +33,7 @@ giants in one another's light are 4 errors off (simulate field --sky bright --si
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -200,29 +200,12 @@ def _larger_profile(solution, i, growth):
     return solution.shapes[i].draw_box(theta, *place, slopes=False)[0]
 
 
-def with_shared_light(errors, doubts, exchanged, own):
-    """Errors of fluxes with what the division of light between neighbours leaves open.
+def flux_changes(doubts, exchanged, own):
+    """The FluxChanges of light that may be another source's, or lost; None without any.
 
     doubts (S, C, k) [counts]: changes of fluxes of scatter 1, each independent of the others
     exchanged (S, S, C) [counts]: see `exchanged_light`; what one source gains the other loses
     own (m, S, C) [counts]: independent changes, of scatter 1, of each source's fluxes alone
-    """
-    s = np.arange(len(exchanged))
-    by_channel = doubts.swapaxes(0, 1)
-    flux = errors.flux + by_channel @ by_channel.swapaxes(1, 2)
-    colour = errors.colour + doubts @ doubts.swapaxes(1, 2) + np.einsum("msc,msd->scd", own, own)
-    both = np.moveaxis(exchanged**2 + exchanged.swapaxes(0, 1) ** 2, -1, 0)
-    flux = flux - both
-    flux[:, s, s] += both.sum(axis=2) + np.square(own).sum(axis=0).T
-    given, taken = (np.moveaxis(e, 0, 1) for e in (exchanged, exchanged.swapaxes(0, 1)))
-    colour = colour + sum(np.einsum("tsc,tsd->scd", e, e) for e in (given, taken))
-    return replace(errors, flux=flux, colour=colour)
-
-
-def flux_changes(doubts, exchanged, own):
-    """The FluxChanges that scatter as `with_shared_light` adds to errors; None without any.
-
-    doubts (S, C, k), exchanged (S, S, C), own (m, S, C) [counts]: see there
     """
     source, doubt = np.nonzero(doubts.any(axis=1))
     giver, taker = np.nonzero(exchanged.any(axis=2))
