@@ -24,11 +24,7 @@ PLACES = [(20.0, 22.0), (20.5, 22.5), (19.7, 21.2)]
 
 def pixel_psf(*sigmas):
     """The effective PSF, of Gaussians behind square pixels, four samples a pixel."""
-    u, images = (np.arange(81) - 40) / 4, []
-    for sigma in sigmas or (SIGMA,):
-        edges = [erf((u + d) / (np.sqrt(2) * sigma)) for d in (0.5, -0.5)]
-        images.append(np.outer(edges[0] - edges[1], edges[0] - edges[1]))
-    return PSF(np.array(images), spacing=0.25)
+    return PSF.gaussian(sigmas or SIGMA, n_pixels=81, spacing=0.25)
 
 
 def exact_light(place, sigma=SIGMA):
