@@ -31,6 +31,8 @@ NARROW_FREQUENCY, MIN_NARROW_TRANSFORM = 0.25, 0.25
 # 0.03 (1.1 and 1.4 px). Two bands of Roman have 0.03.
 MAX_ALIASED = 0.01
 N_WAVES = 33  # along an axis, to measure that
+# [1] Ratio of pixels from which an image that is not dithered has others than the smallest.
+COARSER = 1.5
 # [1] Transfer below which a PSF's waves are noise.
 MIN_TRANSFER = 1e-3
 # [px] Distance between the pixels of two images from which they are dithered.
@@ -203,19 +205,15 @@ def _resolve_more(images, like):
     if not narrow:
         return False
     first, *others = (grid for grid, _ in narrow)
-    of_like = [psf for grid, psf in narrow if _is_like(grid, like)]
+    scales = [grid.pixel_scale_arcsec / like.pixel_scale_arcsec for grid, _ in narrow]
+    on_like = [psf for (_, psf), k in zip(narrow, scales, strict=True) if k < COARSER]
 
     def is_dithered(grid):
         ends = [(0, n - 1) for n in grid.shape]
         away = grid.positions_in(first, *np.meshgrid(*ends, indexing="ij"))
         return bool((np.abs(away - np.rint(away)) > MIN_DITHER_PX).any())
 
-    return any(is_dithered(grid) for grid in others) or _alias_differently(of_like)
-
-
-def _is_like(grid, like):
-    """Returns True if a grid's pixels are as large as those of `like`."""
-    return abs(grid.pixel_scale_arcsec / like.pixel_scale_arcsec - 1) < SAME_SCALE
+    return any(is_dithered(grid) for grid in others) or _alias_differently(on_like)
 
 
 def _alias_differently(psfs):
