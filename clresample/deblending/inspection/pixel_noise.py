@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...sky.noise import second_differences
 from .levels import SIGMAS_A_MAD
 
 # [1] Smallest correlation of neighbouring pixels that is reported. In 280 channels of simulated
@@ -116,12 +117,7 @@ def _correlation(values, pixels):
 
 def _is_white(values, pixels):
     """Returns True if second differences of pixels (My, Mx) are those of white noise."""
-    differences, whole = values, pixels
-    along_y = np.s_[:-2], np.s_[1:-1], np.s_[2:]
-    along_x = np.s_[:, :-2], np.s_[:, 1:-1], np.s_[:, 2:]
-    for low, middle, high in (along_y, along_x):
-        differences = differences[low] - 2 * differences[middle] + differences[high]
-        whole = whole[low] & whole[middle] & whole[high]
+    differences, whole = second_differences(values, pixels)
     if not whole.any():
         return False
     kept = _without_outliers(differences, whole)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...sky.noise import HALF_WIDTH
+from ...sky.noise import HALF_WIDTH, second_differences
 from ...sky.psf import SIGMAS_A_FWHM
 from ..component_images import source_image
 from ..solver.multiscale.prior import gaussian
@@ -117,13 +117,9 @@ def _scatter(values):
 def fine_scatter(image, used):
     """Robust scatter, 1 or more, of pixels (Ny, Nx) [sigma] about their neighbours.
 
-    By second differences along both axes (Immerkaer 1996, CVIU 64, 300): smooth light, which a
-    model may lack, has none.
+    By second differences: smooth light, which a model may lack, has none.
     """
-    along = image[:-2] - 2 * image[1:-1] + image[2:]
-    both = along[:, :-2] - 2 * along[:, 1:-1] + along[:, 2:]
-    whole = used[:-2] & used[1:-1] & used[2:]
-    whole = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
+    both, whole = second_differences(image, used)
     if whole.sum() < MIN_PIXELS // 2:
         return 1.0
     return max(1.0, np.median(np.abs(both[whole])) / (6 * HALF_WIDTH))
