@@ -7,15 +7,12 @@ from itertools import pairwise
 import numpy as np
 
 from ..files.fits_names import check_columns, to_ascii
-from ..sky.frame import model_pixels
 from ..sky.grid import Grid
 from .model_mosaics import file_name
 
 
 def reference_grid(mosaics) -> Grid:
     """The grid of the mosaic with the smallest pixels, the first if several are equal.
-
-    Finer where mosaics resolve more than these, or alias their PSFs differently; see `model_frame`.
 
     Raises ValueError without mosaics, for names or channels that are repeated or not valid in
     tables, and if only some mosaics have zero points or a WCS.
@@ -37,10 +34,8 @@ def reference_grid(mosaics) -> Grid:
         if len(set(have)) > 1:
             has, none = (mosaics[have.index(there)].name for there in (True, False))
             raise ValueError(f"mosaic {has!r} has {what}, {none!r} has none: give all or none")
-    middles = [(np.array(m.grid.shape) - 1) / 2 for m in mosaics]
-    return model_pixels(
-        [(m.grid, m.psf.psf_at(*at)) for m, at in zip(mosaics, middles, strict=True)]
-    )
+    scales = [m.grid.pixel_scale_arcsec for m in mosaics]
+    return mosaics[int(np.argmin(scales))].grid
 
 
 def _check_names(mosaics):

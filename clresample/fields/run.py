@@ -52,8 +52,7 @@ def run_field(
 ) -> FieldRun:
     """Finds, fits and measures every source of a field of mosaics.
 
-    mosaics: sequence of Mosaic; the model's pixels are those of the one with the smallest, or half
-        as long, see `model_frame`
+    mosaics: sequence of Mosaic; the model's pixels are those of the one with the smallest
     folder: for catalogue.{parquet,fits,ecsv}, fit_table.ecsv, models.fits, model and residual
         mosaics, provenance.json; and for work/, what is done so far
     options: FieldOptions

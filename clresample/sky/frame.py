@@ -127,8 +127,11 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     if not 0 < psf_sigma_px < math.inf:
         raise ValueError(f"psf_sigma_px must be a positive number of pixels, not {psf_sigma_px}")
     if grid is None:
-        like = model_pixels([(o.grid, o.psf) for o in observations])
+        scales = np.array([o.grid.pixel_scale_arcsec for o in observations])
+        like = observations[int(np.argmax(scales <= (1 + SAME_SCALE) * scales.min()))].grid
         _check_connected(observations, like)
+        if _resolve_more(observations, like):
+            like = like.refined(REFINEMENT)
         extent = grid_intersection if shared else grid_union
         grid = extent([o.grid for o in observations], like=like)
     grid = as_grid("grid", grid)
@@ -189,24 +192,14 @@ def model_psf(sigma_px=0.8):
     return PSF.gaussian(sigma_px, n_pixels=2 * radius + 1)
 
 
-def model_pixels(images) -> Grid:
-    """A grid whose pixels are those of a model of images; see `model_frame`.
-
-    images: pairs of Grid and PSF
-    """
-    scales = np.array([grid.pixel_scale_arcsec for grid, _ in images])
-    like = images[int(np.argmax(scales <= (1 + SAME_SCALE) * scales.min()))][0]
-    return like.refined(REFINEMENT) if _resolve_more(images, like) else like
-
-
-def _resolve_more(images, like):
-    """Returns True if images together resolve more than the pixels of `like` show."""
-    narrow = [image for image in images if _is_narrow(*image, like)]
+def _resolve_more(observations, like):
+    """Returns True if observations together resolve more than the pixels of `like` show."""
+    narrow = [o for o in observations if _is_narrow(o, like)]
     if not narrow:
         return False
-    first, *others = (grid for grid, _ in narrow)
-    scales = [grid.pixel_scale_arcsec / like.pixel_scale_arcsec for grid, _ in narrow]
-    on_like = [psf for (_, psf), k in zip(narrow, scales, strict=True) if k < COARSER]
+    first, *others = (o.grid for o in narrow)
+    largest = COARSER * like.pixel_scale_arcsec
+    on_like = [o.psf for o in narrow if o.grid.pixel_scale_arcsec < largest]
 
     def is_dithered(grid):
         ends = [(0, n - 1) for n in grid.shape]
@@ -248,11 +241,11 @@ def _alias_differently(psfs):
     return False
 
 
-def _is_narrow(grid, psf, like):
-    """Returns True if one of an image's PSFs has too much transform for pixels of `like`."""
-    scale = grid.pixel_scale_arcsec / like.pixel_scale_arcsec
+def _is_narrow(observation, like):
+    """Returns True if one of an observation's PSFs has too much transform for pixels of `like`."""
+    scale = observation.grid.pixel_scale_arcsec / like.pixel_scale_arcsec
     nu = NARROW_FREQUENCY * scale  # [cycles / observed px]
-    along = psf.otf([nu], [0.0]), psf.otf([0.0], [nu])
+    along = observation.psf.otf([nu], [0.0]), observation.psf.otf([0.0], [nu])
     return bool((np.abs(along).mean(axis=0) > MIN_NARROW_TRANSFORM).any())
 
 

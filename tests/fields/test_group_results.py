@@ -15,13 +15,10 @@ from clresample.fields.execution.group_results import (
     GroupResults,
     GroupResultsFile,
 )
-from clresample.fields.mosaic import Mosaic
 from clresample.fields.run import reference_grid
 from clresample.files.atomic import FileError
 from clresample.measurement.columns import Columns
 from clresample.sky.box import Box
-from clresample.sky.grid import Grid
-from clresample.sky.psf import PSF
 
 PATCH = FitRegion(number=7, parent=3 << 41, box=Box(5, 6, 25, 36), sources=(0,))
 
@@ -188,11 +185,3 @@ def test_mosaics_whose_files_would_be_one_are_refused(sky):
     euclid, rubin = mosaics_of(sky)
     with pytest.raises(ValueError, match="file names of mosaics must be unique, not u_g, u_g"):
         reference_grid([replace(euclid, name="u g"), replace(rubin, name="u_g")])
-
-
-@pytest.mark.parametrize(("sigmas", "n"), [((0.4, 0.55), 80), ((0.4, 0.4), 40), ((1.2, 1.4), 40)])
-def test_pixels_are_finer_where_they_alias_bands_differently(sigmas, n):
-    psf = PSF.gaussian(sigmas, n_pixels=81, spacing=0.25)
-    data, grid = np.zeros((2, 40, 40)), Grid.flat((40, 40), 0.11)
-    mosaic = Mosaic.of_arrays("Roman", data, psf, grid, variance=1.0, channels=("a", "b"))
-    assert reference_grid([mosaic]).shape == (n, n)
