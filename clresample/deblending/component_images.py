@@ -60,6 +60,8 @@ class ComponentImages:
 
     def window(self, *parts, margin=0):
         """Slices (y, x) of the window of all of some components, and of a margin [px] around it."""
+        if len(parts) == 1 and not margin:
+            return box_slices(self.low[parts[0]], self.images[parts[0]].shape[1:])
         low = np.min([self.low[i] for i in parts], axis=0) - margin
         high = np.max([self.low[i] + self.images[i].shape[1:] for i in parts], axis=0) + margin
         low, high = np.maximum(low, 0), np.minimum(high, self.shape[2:])
@@ -76,10 +78,11 @@ class ComponentImages:
         out[:, *here] = image[:, *there]
         return out
 
-    def has_light(self, i, window):
-        """Returns True if component i has pixels of its own on a window (slices y, x)."""
+    def lit_within(self, i, window):
+        """The same, or None where component i has no pixels of its own on the window."""
         pairs = zip(self.window(i), window, strict=True)
-        return all(max(a.start, b.start) < min(a.stop, b.stop) for a, b in pairs)
+        meet = all(max(a.start, b.start) < min(a.stop, b.stop) for a, b in pairs)
+        return self.within(i, window) if meet else None
 
     def total(self, spectra):
         """sum_i spectra[i] rendered[i], (Co, My, Mx); spectra (n, Co)."""
@@ -101,8 +104,8 @@ def source_image(result, source, i_observation, window) -> np.ndarray | None:
     channels, rendered = result.channel_slices()[i_observation], result.rendered[i_observation]
     total = None
     for i, c in enumerate(result.components):
-        if c.source == source and rendered.has_light(i, window):
-            image = c.spectrum[channels, None, None] * rendered.within(i, window)
+        if c.source == source and (own := rendered.lit_within(i, window)) is not None:
+            image = c.spectrum[channels, None, None] * own
             total = image if total is None else total + image
     return total
 

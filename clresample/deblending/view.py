@@ -77,14 +77,6 @@ class WhitenedView:
             self, sqrt_weights=self.sqrt_weights / np.sqrt(1 + (self.sqrt_weights * error) ** 2)
         )
 
-    def for_sources(self, chosen) -> WhitenedView:
-        """The same view of a scene that has the sources `chosen` (k,) of this one alone."""
-        return (
-            self
-            if self.coefficients is None
-            else replace(self, coefficients=self.coefficients[chosen])
-        )
-
     def in_units(self, unit, ties) -> WhitenedView:
         """The same view with data and model in other units (Co,) [counts], and with Ties."""
         ratio = self.noise_unit / unit

@@ -374,8 +374,8 @@ def _companions(sep, signals, one, everything, places, threshold, fwhm, scale, *
             continue
         # two peaks on either side of a maximum are one source, as is what pixels as large as the
         # PSF leave beside a star's own maximum
-        others = [*centres, *(position for position, _ in found)]
-        if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p in others):
+        others = np.array([*centres, *(position for position, _ in found)])
+        if np.hypot(*(others - top).T).min() <= SAME_SOURCE * fwhm:
             continue
         if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:
             continue

@@ -31,7 +31,7 @@ NARROW_FREQUENCY, MIN_NARROW_TRANSFORM = 0.25, 0.25
 # 0.03 (1.1 and 1.4 px). Two bands of Roman have 0.03.
 MAX_ALIASED = 0.01
 N_WAVES = 33  # along an axis, to measure that
-# [1] Ratio of pixels from which an image that is not dithered has others than the smallest.
+# [1] of the smallest pixels: images of larger ones, which are not dithered, do not have the same.
 COARSER = 1.5
 # [1] Transfer below which a PSF's waves are noise.
 MIN_TRANSFER = 1e-3
@@ -108,8 +108,8 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     grid: Grid to use unchanged; None = the pixels and orientation of the observation with the
         smallest pixels (the first if several are equal), as many pixels as needed; its pixels
         halved if two or more observations, dithered or rotated, have a PSF of less than about two
-        of them: together these resolve more than each does. Halved also for two or more bands on
-        the same pixels that these alias differently, as those of Roman
+        of them: together these resolve more than each does. Halved also for two or more PSFs
+        that the same pixels alias differently, as those of Roman's bands
     psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel;
         no more than the frame has pixels along a side
     shared: cover the intersection of the observations' footprints instead of their union
@@ -199,7 +199,8 @@ def _resolve_more(observations, like):
         return False
     first, *others = (o.grid for o in narrow)
     largest = COARSER * like.pixel_scale_arcsec
-    on_like = [o.psf for o in narrow if o.grid.pixel_scale_arcsec < largest]
+    # only samples finer than the pixels have waves that these alias
+    on_like = [o.psf for o in narrow if o.grid.pixel_scale_arcsec < largest and o.psf.spacing < 1]
 
     def is_dithered(grid):
         ends = [(0, n - 1) for n in grid.shape]
@@ -217,17 +218,14 @@ def _alias_differently(psfs):
 
         sum_nu,m |P(nu) T_m(nu) - P(nu + m)|^2 / sum_nu |P(nu)|^2
 
-    along each axis, m = -1, 1, with T_m(nu) = mean P(nu + m) / mean P(nu).
+    along each axis, m = -1, 1, with T_m(nu) = mean P(nu + m) / mean P(nu) where that is no noise.
     """
     if sum(psf.n_bands for psf in psfs) < 2:
         return False
-    nu, none = np.linspace(-0.5, 0.5, N_WAVES), np.zeros(1)
-    for along_y in (True, False):
-        waves = []
-        for m in (0, -1, 1):
-            axes = (nu + m, none) if along_y else (none, nu + m)
-            waves.append(np.concatenate([psf.otf(*axes).reshape(-1, N_WAVES) for psf in psfs]))
-        own, *aliased = waves
+    nu, none = np.array([[0], [-1], [1]]) + np.linspace(-0.5, 0.5, N_WAVES), np.zeros(1)
+    for axes in (nu, none), (none, nu):
+        waves = np.concatenate([psf.otf(*axes).reshape(-1, *nu.shape) for psf in psfs])
+        own, *aliased = waves.swapaxes(0, 1)
         mean = own.mean(axis=0)
         parts = (
             wave.mean(axis=0) * mean.conj() / (np.abs(mean) ** 2 + MIN_TRANSFER**2)

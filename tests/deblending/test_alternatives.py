@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.batch import deblend
+from clresample.deblending.linear.spectra import MODEL_ERROR
 from clresample.deblending.start import profile_fit, wide_light
 from clresample.deblending.start.alternatives import Alternatives
 from clresample.deblending.start.population import NEIGHBOUR_MODEL_ERROR, STAR_MODEL_ERROR
@@ -45,7 +46,11 @@ def test_products_with_errors_of_other_models(device, monkeypatch):
         normal, spectra = fit.looking.normal[0][:, :3, :3].copy(), fit.looking.spectra.copy()
         thetas = fit.thetas()
         own = {i: [thetas[i], thetas[i] + [step, 0, 0, 0]] for i, step in ((1, 1.5), (0, 0.7))}
+        fit.looking.compute_residuals(MODEL_ERROR)
+        level = fit.looking.of_level()
         found.append((Alternatives(fit, own), normal, spectra))
+        for before, after in zip(level, fit.looking.of_level(), strict=True):
+            np.testing.assert_allclose(after, before, rtol=1e-6)  # that of all models
 
     monkeypatch.setattr(profile_fit, "fit_faint_shapes", looked)
     light_of = [(places[0], 3000.0, 3.0), (places[1], 500.0, 2.0), (places[2], 2000.0, 0.0)]

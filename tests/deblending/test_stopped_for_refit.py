@@ -140,9 +140,7 @@ def test_a_fit_that_was_taken_over_and_interrupted_says_so(when, monkeypatch):
 
 @pytest.mark.parametrize("evidence", [None, [1.9], [2.6, 2.8]])
 def test_a_scene_is_taken_over_where_a_gradient_is_clear(evidence, monkeypatch):
-    asked = evidence and GradientTest(
-        np.arange(len(evidence)), np.array(evidence), np.ones((3, 2)), []
-    )
+    asked = evidence and GradientTest(np.arange(len(evidence)), np.array(evidence), np.ones((3, 2)))
     monkeypatch.setattr(two_component_fit, "run_gradient_tests", lambda fits: [asked])
     assert two_component_fit.needs_second_component("fit") == (evidence == [2.6, 2.8])
 

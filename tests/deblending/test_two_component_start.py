@@ -78,9 +78,7 @@ def test_a_core_begins_beside_each_component_in_question():
         sky=np.zeros(2),
         spectrum_curvature=np.array([[1.0, 1.0], [2.0, 2.0]]),
     )
-    asked = GradientTest(
-        np.array([0, 1]), np.array([0.0, 9.0]), np.array([[7.0] * 2, [8.0] * 2]), []
-    )
+    asked = GradientTest(np.array([0, 1]), np.array([0.0, 9.0]), np.array([[7.0] * 2, [8.0] * 2]))
     found = second._with_cores(SimpleNamespace(start=begin, frame=home), asked)
     assert found.source.tolist() == [1, 0, 0] and found.shapes == ["other", shape, shape]
     assert found.thetas[0] == "its" and found.thetas[1] is theta and theta[0] == 1.2

@@ -80,14 +80,6 @@ def test_an_error_of_the_model_is_added_to_the_noise():
     np.testing.assert_allclose(found, before + 9)
 
 
-def test_a_view_of_some_sources_has_their_shares():
-    shares = np.arange(12.0).reshape(3, 2, 2)
-    one, _ = view(shares)
-    np.testing.assert_array_equal(one.for_sources([2, 0]).coefficients, shares[[2, 0]])
-    plain, _ = view()
-    assert plain.for_sources([0]) is plain
-
-
 def test_typical_noise_is_the_median_of_what_was_seen():
     assert _typical_noise(np.array([0.0, 1.0, 4.0, 16.0, 0.0])) == 0.5
     assert _typical_noise(np.zeros(3)) == 1 and _typical_noise(np.array([0.0, 0.25])) == 2

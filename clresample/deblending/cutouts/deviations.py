@@ -54,7 +54,7 @@ def _of_draws(result, chosen, i_observation, window):
         here, there = intersect_boxes(
             (0, 0), shape, np.subtract(c.origin, corner), c.morphology.shape
         )
-        seen = rendered.within(i, window) if rendered.has_light(i, window) else None
+        seen = rendered.lit_within(i, window)
         inside = all(part.stop > part.start for part in here)
         if seen is None and not inside:
             continue
@@ -105,7 +105,7 @@ def _of_fluxes(result, chosen, i_observation, window):
     if result.errors is None:
         covariance = result.covariance[channels]
         for i, c in enumerate(result.components):
-            units.append(rendered.within(i, window) if rendered.has_light(i, window) else None)
+            units.append(rendered.lit_within(i, window))
             owners.append(c.source)
     else:
         covariance = result.errors.flux[channels]

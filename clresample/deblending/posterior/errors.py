@@ -87,13 +87,13 @@ class FluxChanges:
         return out
 
     def added_to(self, errors) -> Errors:
-        """Errors with the covariance of these changes too."""
+        """Errors with the covariance of these changes too, of which each is once in a source."""
         flux, colour = errors.flux.copy(), errors.colour.copy()
-        np.add.at(colour, self.source, self.by[:, :, None] * self.by[:, None])
         shape = len(colour), self.change.max(initial=-1) + 1
-        for own, by in zip(flux, self.by.T, strict=True):
+        for c, by in enumerate(self.by.T):
+            np.add.at(colour[:, c], self.source, by[:, None] * self.by)
             changes = csr_array((by, (self.source, self.change)), shape)
-            own += (changes @ changes.T).toarray()
+            flux[c] += (changes @ changes.T).toarray()
         return replace(errors, flux=flux, colour=colour)
 
 

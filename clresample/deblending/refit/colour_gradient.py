@@ -45,13 +45,11 @@ class GradientTest:
 
     components (k,): the components; evidence (k,): ln of the ratio of evidences for a gradient
     power (k, C): sum u^2 of their cores' whitened images u
-    observed: per view, ComponentImages (n, Co, My, Mx) of all n components' morphologies
     """
 
     components: np.ndarray
     evidence: np.ndarray
     power: np.ndarray
-    observed: list[ComponentImages]
 
     @property
     def significant(self):
@@ -105,7 +103,7 @@ def _asked(fit, which, seen):
     precision /= np.maximum(chi2, 1)[:, None]
     error = 1 / np.sqrt(np.maximum(power[which], 1e-30))
     rows = zip(core, precision, np.maximum(spectra[which], error), strict=True)
-    return GradientTest(which, np.array([log_evidence_ratio(*row) for row in rows]), cores, bare)
+    return GradientTest(which, np.array([log_evidence_ratio(*row) for row in rows]), cores)
 
 
 def _eliminated(covariance, slope, power, k):

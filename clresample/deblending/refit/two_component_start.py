@@ -160,7 +160,7 @@ def _cores(n, chosen):
 def _going_on(state, first, before, new):
     """A State whose morphologies, unless new, are those of the first fit.
 
-    state: at the start of all; first: a finished Fit; before, new: see `_places`
+    state: at the start of all; first: a finished Fit; before, new: see `_cores`
     """
     end, steps = first.state, first.settings.prior.steps
     known, structure, morph = end.learned, [], []

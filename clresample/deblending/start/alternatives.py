@@ -49,8 +49,10 @@ class Alternatives:
             for i, present in zip(self.component, self._is_first, strict=True)
         ]
         stars, spectra = fit.population.stars[fit.at][:, None], looking.spectra
-        parts = [_residuals(looking, part) for part in (0 * spectra, spectra)]
-        parts.insert(1, _residuals(looking, spectra * stars) if stars.any() else parts[0])
+        # That of all models last: `looking.of_level` is about it from then on.
+        data = _residuals(looking, 0 * spectra)
+        without_stars = _residuals(looking, spectra * stars) if stars.any() else data
+        parts = data, without_stars, _residuals(looking, spectra)
         peaks = peaks_of(self.listed, self.theta)
         brightness = fit.brightness[self.component] * faint
         brightness *= np.minimum(peaks / peaks[self.first][self.owner], 1)
