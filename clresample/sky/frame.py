@@ -225,16 +225,10 @@ def _alias_differently(psfs):
     nu, none = np.array([[0], [-1], [1]]) + np.linspace(-0.5, 0.5, N_WAVES), np.zeros(1)
     for axes in (nu, none), (none, nu):
         waves = np.concatenate([psf.otf(*axes).reshape(-1, *nu.shape) for psf in psfs])
-        own, *aliased = waves.swapaxes(0, 1)
-        mean = own.mean(axis=0)
-        parts = (
-            wave.mean(axis=0) * mean.conj() / (np.abs(mean) ** 2 + MIN_TRANSFER**2)
-            for wave in aliased
-        )
-        wrong = sum(
-            np.abs(own * part - wave) ** 2 for part, wave in zip(parts, aliased, strict=True)
-        )
-        if (wrong.mean(axis=1) > MAX_ALIASED**2 * (np.abs(own) ** 2).mean(axis=1)).any():
+        mean, own = waves.mean(axis=0), waves[:, :1]
+        parts = mean[1:] * mean[0].conj() / (np.abs(mean[0]) ** 2 + MIN_TRANSFER**2)
+        wrong, power = np.abs(own * parts - waves[:, 1:]) ** 2, np.abs(own) ** 2
+        if (wrong.sum(axis=(1, 2)) > MAX_ALIASED**2 * power.sum(axis=(1, 2))).any():
             return True
     return False
 

@@ -127,8 +127,9 @@ def second_differences(image, used):
 
     Both (Ny - 2, Nx - 2). Smooth light has none (Immerkaer 1996, CVIU 64, 300).
     """
-    for one in (np.s_[:-2], np.s_[1:-1], np.s_[2:]), (np.s_[:, :-2], np.s_[:, 1:-1], np.s_[:, 2:]):
-        low, middle, high = one
+    along_y = np.s_[:-2], np.s_[1:-1], np.s_[2:]
+    along_x = np.s_[:, :-2], np.s_[:, 1:-1], np.s_[:, 2:]
+    for low, middle, high in (along_y, along_x):
         image = image[low] - 2 * image[middle] + image[high]
         used = used[low] & used[middle] & used[high]
     return image, used

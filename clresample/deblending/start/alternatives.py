@@ -49,17 +49,17 @@ class Alternatives:
             for i, present in zip(self.component, self._is_first, strict=True)
         ]
         stars, spectra = fit.population.stars[fit.at][:, None], looking.spectra
-        # That of all models last: `looking.of_level` is about it from then on.
-        data = _residuals(looking, 0 * spectra)
-        without_stars = _residuals(looking, spectra * stars) if stars.any() else data
-        parts = data, without_stars, _residuals(looking, spectra)
+        # no models, those of stars, and last all, as `looking.of_level` is about what these leave
+        models = [0, stars, 1] if stars.any() else [0, 1]
+        parts = [_residuals(looking, spectra * which) for which in models]
         peaks = peaks_of(self.listed, self.theta)
         brightness = fit.brightness[self.component] * faint
         brightness *= np.minimum(peaks / peaks[self.first][self.owner], 1)
         self.around = looking.with_components(renumbered(self.listed))
         scenes = np.unique(self.around.scene)
         self.around.render(scenes, self.theta, brightness, slopes=False)
-        (light, _), (unstarred, _), (rest, self.level) = (self._products(part) for part in parts)
+        products = [self._products(part) for part in parts]
+        (light, _), (unstarred, _), (rest, self.level) = products[0], products[-2], products[-1]
         self.alone, self.explained = self._products_of_own(spectra)
         self.right = rest + self.explained
         others = unstarred + self.explained * stars[self.component] - self.right
